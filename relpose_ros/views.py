@@ -1,0 +1,85 @@
+"""What the sensors gave: boxes, views and scans. Data only.
+
+Pixel coordinates are those of the full camera image, x right and y down, with (0, 0) at the outer
+corner of the first pixel (its centre is (0.5, 0.5)). ROS and OpenCV put (0, 0) at that centre:
+whatever reads such messages adds half a pixel, once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+MIN_VIEWS = 2
+MAX_VIEWS = 8
+"""The network's index table has eight rows (RelPose++ is trained on 2 to 8 views)."""
+
+
+@dataclass(frozen=True)
+class BoundingBox:
+    """An axis-aligned box in the full image, pixels: left, top, right, bottom."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    @property
+    def width(self) -> float:
+        """Width in pixels."""
+        return self.x1 - self.x0
+
+    @property
+    def height(self) -> float:
+        """Height in pixels."""
+        return self.y1 - self.y0
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole intrinsics of the full, rectified image, in pixels (corner convention, see above)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One picture of the object.
+
+    Two views are equal only when they are the same object: a view is the key under which its
+    features are kept, and comparing pixels would cost more than recomputing them.
+    """
+
+    image: npt.NDArray[np.uint8]
+    """(H, W, 3) RGB. The whole camera image, or the part of it that starts at ``origin``."""
+    box: BoundingBox
+    """The object's box, in the full image."""
+    full_width: int
+    """Width of the full image, pixels."""
+    full_height: int
+    """Height of the full image, pixels."""
+    origin: tuple[int, int] = (0, 0)
+    """Column and row of ``image``'s first pixel in the full image."""
+    stamp_ns: int = 0
+    """Acquisition time, nanoseconds (the message's own stamp, never the time of arrival)."""
+    frame_id: str = ""
+    """The camera's optical frame (REP-103: x right, y down, z forward)."""
+    intrinsics: Intrinsics | None = None
+    """None where the camera said nothing."""
+    mask: npt.NDArray[np.bool_] | None = None
+    """(H, W), True on the object; None where nobody segmented it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """The views held of one object, oldest first. The first one sets the gauge of the estimate."""
+
+    object_id: str
+    views: tuple[View, ...]
