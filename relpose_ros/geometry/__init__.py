@@ -1,0 +1,1 @@
+"""Pure maths: rotations, their grid, cameras and alignments. No images, no network."""

@@ -1,0 +1,106 @@
+"""Nested equivolumetric grid on SO(3): HEALPix on the sphere times a circle.
+
+Yershova et al. 2010 (Generating uniform incremental grids on SO(3) using the Hopf fibration), as used by
+Murphy et al. 2021 (Implicit-PDF). Level r has 72 * 8^r cells of equal volume: 12 * 4^r HEALPix pixels,
+each with 6 * 2^r tilts. The cells nest: cell k of a level lies in cell k // 8 of the level above, and the
+index of a cell is its level-0 index followed by one octal digit a level: tilt bit, then the two pixel bits.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    FloatArray = npt.NDArray[np.float64]
+    IntArray = npt.NDArray[np.int64]
+
+BASE_TILTS = 6
+BASE_CELLS = 12 * BASE_TILTS
+MAX_LEVEL = 8
+"""1.2 thousand million cells: beyond it an index would still be exact, an array of cells would not fit."""
+
+
+def size(level: int) -> int:
+    """Number of cells of a level: 72 * 8^level."""
+    if not 0 <= level <= MAX_LEVEL:
+        raise ValueError(f"The rotation grid has the levels 0 to {MAX_LEVEL}, there is no level {level}.")
+    return int(BASE_CELLS * 8**level)
+
+
+@lru_cache(maxsize=8)
+def grid(level: int) -> FloatArray:
+    """Centres of all cells of a level, read-only. -> (72 * 8^level, 3, 3)."""
+    rotations = cell_rotations(level, np.arange(size(level)))
+    rotations.flags.writeable = False
+    return rotations
+
+
+def children(cells: npt.ArrayLike) -> IntArray:
+    """Indices, one level down, of the eight cells inside each. (K,) -> (8 K,), parents in order."""
+    return np.asarray(np.asarray(cells, np.int64)[..., None] * 8 + np.arange(8)).reshape(-1)
+
+
+def cell_spacing(level: int) -> float:
+    """Edge in rad of a cube with the volume of one cell: 1.12 at level 0, halved at each level.
+
+    SO(3) has the volume 8 pi^2 where lengths are rotation angles.
+    """
+    return float((8 * np.pi**2 / size(level)) ** (1 / 3))
+
+
+def cell_rotations(level: int, cells: npt.ArrayLike) -> FloatArray:
+    """Centres of the given cells of a level. (K,) indices -> (K, 3, 3)."""
+    rest = np.asarray(cells, np.int64)
+    if rest.size and not (rest.min() >= 0 and rest.max() < size(level)):
+        raise ValueError(f"Level {level} of the rotation grid has {size(level)} cells; an index is outside them.")
+    column, row, tilt = np.zeros_like(rest), np.zeros_like(rest), np.zeros_like(rest)
+    for bit in range(level):
+        digit = rest & 7
+        column |= (digit & 1) << bit
+        row |= (digit >> 1 & 1) << bit
+        tilt |= (digit >> 2) << bit
+        rest = rest >> 3
+    tilt |= (rest % BASE_TILTS) << level
+    belt = 1 - rest // BASE_TILTS // 4
+    azimuth, height = _pixel_centre(rest // BASE_TILTS, column, row, 1 << level)
+    turn = (tilt + 0.5) * (2 * np.pi / (BASE_TILTS << level))
+    # Tilts count from a frame that is smooth over each diamond, also where four of them meet at a pole:
+    # counted from the meridian, polar cells would be sheared by up to a quarter turn at every level.
+    return _from_hopf(azimuth, height, turn - belt * azimuth)
+
+
+def _pixel_centre(
+    face: IntArray, column: IntArray, row: IntArray, side: int
+) -> tuple[FloatArray, FloatArray]:
+    """Azimuth and height z of HEALPix pixels, from their place in one of the twelve base diamonds.
+
+    By the inverse of the HEALPix map projection (Calabretta and Roukema 2007), in which every pixel is
+    a square standing on its corner: belts of diamonds at latitude +1, 0, -1 (in units of pi/4).
+    """
+    belt = 1 - face // 4
+    middle = (np.pi / 2) * (face % 4) + (np.pi / 4) * np.abs(belt)
+    east, north = (column + 0.5) / side, (row + 0.5) / side
+    x = middle + (np.pi / 4) * (east - north)
+    y = belt + east + north - 1
+    polar = np.abs(y) > 1
+    width = np.where(polar, 2 - np.abs(y), 1.0)  # parallels shrink towards a pole
+    azimuth = middle + (x - middle) / width
+    height = np.where(polar, np.sign(y) * (1 - width * width / 3), y * (2 / 3))
+    return azimuth, height
+
+
+def _from_hopf(azimuth: FloatArray, height: FloatArray, turn: FloatArray) -> FloatArray:
+    """``Rz(azimuth) Ry(polar angle) Rz(turn)``: where the z axis goes, and how far it is turned about itself."""
+    c, s = height, np.sqrt(np.maximum(0, 1 - height * height))
+    ca, sa, ct, st = np.cos(azimuth), np.sin(azimuth), np.cos(turn), np.sin(turn)
+    rows = [
+        *(ca * c * ct - sa * st, -ca * c * st - sa * ct, ca * s),
+        *(sa * c * ct + ca * st, -sa * c * st + ca * ct, sa * s),
+        *(-s * ct, s * st, c),
+    ]
+    return np.stack(rows, -1).reshape(*azimuth.shape, 3, 3)
