@@ -1,0 +1,198 @@
+"""The settings of a scanner, in one place: defaults, descriptions, ranges and their validation.
+
+The node declares its ROS parameters from these fields; the replay reads the same parameter file.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from relpose_ros.errors import RelPoseError
+from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+MAX_NAME_LENGTH = 128
+"""Longest object id or frame name, characters: a longer one is garbage, and it would go out with every message."""
+
+
+class SettingsError(RelPoseError):
+    """A setting has a value it cannot have, or the parameter file cannot be read."""
+
+
+def _setting(
+    default: Any,
+    description: str,
+    *,
+    choices: tuple[str, ...] | None = None,
+    limits: tuple[float, float] | None = None,
+    fixed: bool = False,
+) -> Any:
+    """A field whose metadata say what a parameter descriptor needs to know.
+
+    ``fixed`` marks what only matters while a node starts, so that setting it later would do nothing.
+    """
+    metadata = {"description": description, "choices": choices, "range": limits, "fixed": fixed}
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class ScanSettings:
+    """Everything about a scan that a user may choose.
+
+    Each field's metadata hold ``description`` (str), ``range`` (lowest and highest, or None),
+    ``choices`` (allowed words, or None) and ``fixed`` (bool: read once, while the node starts).
+
+    Raises:
+        SettingsError: A value has the wrong type or lies outside its range.
+    """
+
+    object_frame: str = _setting(
+        "object",
+        "Name of the object frame in outgoing headers. Keep it apart from map and odom: its scale is usually unknown.",
+    )
+    object_id: str = _setting(
+        "object",
+        "Object id of views that come as Image + CameraInfo, which carry none, or as ObjectView with an empty one.",
+    )
+    max_views: int = _setting(
+        MAX_VIEWS,
+        "Most views held of one object. Time per estimate grows with the number of pairs; the network knows 8 views.",
+        limits=(MIN_VIEWS, MAX_VIEWS),
+    )
+    keep: str = _setting(
+        "spread",
+        "Which views stay when more than max_views arrive. first: the earliest, so that poses never change frame. "
+        "latest: the newest, for an object that moves now and then; the frame moves on with the oldest view. "
+        "spread: the first and those that look from directions furthest apart, for an orbit of many frames.",
+        choices=("first", "latest", "spread"),
+    )
+    max_scans: int = _setting(
+        4,
+        "Most objects held at once; a further one takes the place of the object seen longest ago. Bounds memory where "
+        "a tracker numbers its objects without end.",
+        limits=(1, 64),
+    )
+    pairing_queue: int = _setting(
+        30,
+        "Most images, and most camera infos, that wait for the other one of the same stamp. Bounds memory: each "
+        "waiting image is held whole.",
+        limits=(1, 1000),
+    )
+    backward_jump_s: float = _setting(
+        1.0,
+        "How far back, in seconds, a stamp must lie to count as time jumping backwards (a bag that loops) and not as "
+        "a late message. A second message must confirm the jump before the scan starts anew.",
+        limits=(0.001, 86400.0),
+    )
+    image_transports: tuple[str, ...] = _setting(
+        ("raw", "compressed"),
+        "Which kinds of image topic to listen to: raw (image) and compressed (image/compressed).",
+        choices=("raw", "compressed"),
+        fixed=True,
+    )
+    weights: str = _setting("", "Path of a weights file; empty: the compact weights that ship with the package.")
+    threads: int = _setting(
+        0,
+        "Threads of the network on the CPU; 0: as many as PyTorch takes by itself. Fewer leave cores to others.",
+        limits=(0, 256),
+    )
+    autostart: bool = _setting(
+        True,
+        "Whether the node configures and activates itself; false leaves that to a lifecycle manager.",
+        fixed=True,
+    )
+    diagnostics: bool = _setting(True, "Whether the node's state goes out on /diagnostics.")
+    diagnostics_period_s: float = _setting(
+        1.0, "Seconds between two diagnostics messages.", limits=(0.1, 60.0)
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse what no scanner could work with."""
+        for each in fields(self):
+            _check(each.name, getattr(self, each.name), each.default, each.metadata)
+        for name in ("object_frame", "object_id"):
+            value = getattr(self, name)
+            if not value or len(value) > MAX_NAME_LENGTH or not value.isprintable():
+                text = (
+                    f"{name} is {value[:40]!r}: give a name of 1 to {MAX_NAME_LENGTH} printable characters."
+                )
+                raise SettingsError(text)
+        if not self.image_transports:
+            raise SettingsError("image_transports is empty: name raw, compressed or both.")
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> ScanSettings:
+        """Settings from names and values, as a parameter file or a node's parameters have them.
+
+        Names that are missing keep their defaults.
+
+        Raises:
+            SettingsError: An unknown name, or a value that its setting cannot have.
+        """
+        defaults = {each.name: each.default for each in fields(cls)}
+        unknown = [str(name) for name in values if name not in defaults]
+        if unknown:
+            text = f"There is no setting {', '.join(unknown)}: the settings are {', '.join(defaults)}."
+            raise SettingsError(text)
+        given = {name: _like_default(value, defaults[name]) for name, value in values.items()}
+        return cls(**given)
+
+    @classmethod
+    def from_yaml(cls, path: Path) -> ScanSettings:
+        """Settings from a ROS 2 parameter file (``/**: ros__parameters: ...``).
+
+        With several nodes in the file, those named ``/**``, ``scan_node`` or ``/scan_node`` count, a later
+        one over an earlier one. ``use_sim_time`` and ``qos_overrides`` are the node's own and are passed over.
+
+        Raises:
+            SettingsError: The file cannot be read, is no parameter file, or holds a wrong value.
+        """
+        try:
+            document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as err:
+            raise SettingsError(f"The parameter file {path} cannot be read: {err}.") from err
+        values: dict[str, Any] = {}
+        found = False
+        for node, content in document.items() if isinstance(document, dict) else ():
+            if node not in {"/**", "scan_node", "/scan_node", "/**/scan_node"}:
+                continue
+            parameters = content.get("ros__parameters") if isinstance(content, dict) else None
+            if not isinstance(parameters, dict):
+                raise SettingsError(f"{path}: {node} has no ros__parameters.")
+            found = True
+            values.update(parameters)
+        if not found:
+            text = f"{path} holds no parameters of the scan node: start it with '/**:' and 'ros__parameters:'."
+            raise SettingsError(text)
+        own = {name: value for name, value in values.items() if name not in {"use_sim_time", "qos_overrides"}}
+        return cls.from_mapping(own)
+
+
+def _like_default(value: Any, default: Any) -> Any:
+    """A file's or a parameter's spelling of a value, in the type its setting has."""
+    if isinstance(default, tuple) and isinstance(value, (list, tuple)):
+        return tuple(value)
+    if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return value
+
+
+def _check(name: str, value: Any, default: Any, metadata: Mapping[str, Any]) -> None:
+    if type(value) is not type(default):
+        text = f"{name} is {value!r}, a {type(value).__name__}: it must be a {type(default).__name__}."
+        raise SettingsError(text)
+    choices = metadata["choices"]
+    if choices is not None:
+        for word in value if isinstance(value, tuple) else (value,):
+            if word not in choices:
+                raise SettingsError(f"{name} is {word!r}: it must be one of {', '.join(choices)}.")
+    limits = metadata["range"]
+    if limits is not None and not (math.isfinite(value) and limits[0] <= value <= limits[1]):
+        raise SettingsError(f"{name} is {value}: it must lie between {limits[0]} and {limits[1]}.")
