@@ -1,0 +1,1 @@
+"""Metrics, baselines and protocol of RelPose++'s evaluation."""

@@ -1,0 +1,159 @@
+"""Ways to get poses from views: the shipped estimator, and what it is measured against."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from relpose_ros.geometry.cameras import translation_of
+from relpose_ros.views import Scan
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy.typing as npt
+
+    from relpose_ros.inference.estimator import Estimator
+    from relpose_ros.views import View
+
+    FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """camera_from_world of each view, in a world and unit of the method's own."""
+
+    rotations: FloatArray
+    """(N, 3, 3), nan where the method has no answer."""
+    translations: FloatArray
+    """(N, 3), nan likewise."""
+
+
+class Method(Protocol):
+    """Something that estimates the poses of a scan."""
+
+    name: str
+    """As it stands in a table."""
+
+    def poses(self, views: Sequence[View]) -> Poses:
+        """Poses of 2 to 8 views, in their order."""
+        ...
+
+
+class Learned:
+    """The estimator of this package."""
+
+    name = "relpose"
+
+    def __init__(self, estimator: Estimator) -> None:
+        """Wrap an estimator, whose feature cache makes prefixes of a scan cheap."""
+        self._estimator = estimator
+        self._last: tuple[tuple[View, ...], Poses] | None = None
+
+    def poses(self, views: Sequence[View]) -> Poses:
+        """See `Method`. The latest answer is kept: `ConstantTranslation` asks for the same one."""
+        key = tuple(views)
+        if self._last is None or self._last[0] != key:
+            estimate = self._estimator.estimate(Scan(object_id="evaluation", views=key))
+            rotations = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
+            positions = np.stack([camera.position for camera in estimate.cameras])
+            self._last = key, Poses(rotations, translation_of(rotations, positions))
+        return self._last[1]
+
+
+class ConstantTranslation:
+    """Rotations of another method, every camera at distance 1 and facing the object (an ablation)."""
+
+    def __init__(self, rotations_from: Method) -> None:
+        """Take the rotations of ``rotations_from``."""
+        self.name = "constant-translation"
+        self._method = rotations_from
+
+    def poses(self, views: Sequence[View]) -> Poses:
+        """See `Method`."""
+        rotations = self._method.poses(views).rotations
+        translations = np.where(np.isfinite(rotations[:, :, 0]), [0.0, 0.0, 1.0], np.nan)
+        return Poses(rotations, translations)
+
+
+class Identity:
+    """All cameras at one place, one way round: what a scan of near neighbours rewards."""
+
+    name = "identity"
+
+    def poses(self, views: Sequence[View]) -> Poses:
+        """See `Method`."""
+        return Poses(np.tile(np.eye(3), (len(views), 1, 1)), np.tile([0.0, 0.0, 1.0], (len(views), 1)))
+
+
+class Colmap:
+    """SIFT, exhaustive matching and incremental mapping by pycolmap, on whole images.
+
+    It gets what it can use: the intrinsics where they are known, and the mask where there is one
+    (an object turned in front of a fixed camera has a background that contradicts its motion).
+    Views missing from the largest reconstruction have no answer.
+    """
+
+    name = "colmap"
+
+    def __init__(self, seed: int = 0) -> None:
+        """Import pycolmap, which only this baseline needs."""
+        import pycolmap
+
+        self._colmap: Any = pycolmap
+        self._seed = seed
+        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+
+    def poses(self, views: Sequence[View]) -> Poses:
+        """See `Method`."""
+        rotations, translations = np.full((len(views), 3, 3), np.nan), np.full((len(views), 3), np.nan)
+        with tempfile.TemporaryDirectory() as folder:
+            found = self._reconstruct(views, Path(folder))
+        for k, pose in found.items():
+            rotations[k], translations[k] = pose[:, :3], pose[:, 3]
+        return Poses(rotations, translations)
+
+    def _reconstruct(self, views: Sequence[View], folder: Path) -> dict[int, FloatArray]:
+        """camera_from_world (3, 4) of the views in the largest reconstruction, by position."""
+        import cv2
+
+        colmap = self._colmap
+        colmap.set_random_seed(self._seed)
+        database, images, masks = folder / "database.db", folder / "images", folder / "masks"
+        for k, view in enumerate(views):
+            camera_images = images / str(k)
+            camera_images.mkdir(parents=True)
+            name = f"{k}/{k}.png"
+            cv2.imwrite(str(images / name), view.image[..., ::-1])
+            (masks / str(k)).mkdir(parents=True)
+            if view.mask is not None:
+                cv2.imwrite(str(masks / f"{name}.png"), view.mask.astype(np.uint8) * 255)
+            reader = colmap.ImageReaderOptions(mask_path=str(masks) if view.mask is not None else "")
+            if view.intrinsics is not None:
+                x0, y0 = view.origin
+                i = view.intrinsics
+                reader.camera_model = "PINHOLE"
+                reader.camera_params = f"{i.fx},{i.fy},{i.cx - x0},{i.cy - y0}"
+            colmap.extract_features(
+                database,
+                images,
+                image_names=[name],
+                camera_mode=colmap.CameraMode.PER_IMAGE,
+                reader_options=reader,
+                device=colmap.Device.cpu,
+            )
+        colmap.match_exhaustive(database, device=colmap.Device.cpu)
+        options = colmap.IncrementalPipelineOptions(min_model_size=2, multiple_models=True)
+        models = colmap.incremental_mapping(database, images, folder / "models", options=options)
+        if not models:
+            return {}
+        largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
+        return {
+            int(image.name.partition("/")[0]): np.asarray(image.cam_from_world().matrix())
+            for image in largest.images.values()
+            if image.has_pose
+        }
