@@ -1,0 +1,1 @@
+"""From pair energies to rotations, poses and how far to trust them."""

@@ -1,0 +1,214 @@
+"""One rotation per camera that all pairs agree with best: the joint maximum of the pairs' energies.
+
+Cameras join in the order of a maximum spanning tree over the pairs' modes. Where RelPose++ keeps one
+rotation per camera (the best mode along the tree), a beam of partial solutions is kept here, each camera
+tried at every mode of every pair that ties it to those already placed. The best ends climb by block
+coordinate ascent with a shrinking neighbourhood, then all rotations together along the gradient.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from relpose_ros.geometry import so3
+from relpose_ros.inference.pair_distribution import PairDistributions
+from relpose_ros.inference.pair_energies import PairEnergies
+
+
+@dataclass(frozen=True)
+class AscentSettings:
+    """How the joint maximum is looked for."""
+
+    beam: int = 12
+    """Partial solutions kept while cameras join."""
+    starts: int = 6
+    """Complete ones that are climbed."""
+    radii: tuple[float, ...] = tuple(math.radians(a) for a in (16, 10, 6, 4, 2.5, 1.5, 0.8))
+    """Neighbourhood of each sweep over the cameras, rad."""
+    halving: int = 2
+    """After every so many sweeps the worse half of the climbers stops."""
+    polish_steps: int = 24
+    """Joint gradient steps at the end."""
+    distinct: float = math.radians(10)
+    """Solutions are different where some camera differs by more, rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointSolutions:
+    """Distinct local maxima of the joint energy, best first."""
+
+    rotations: torch.Tensor
+    """(S, N, 3, 3) float64, camera_from_object, the first camera the identity."""
+    scores: torch.Tensor
+    """(S,) float64: sum of the pairs' energies."""
+
+
+def joint_scores(energies: PairEnergies, rotations: torch.Tensor) -> torch.Tensor:
+    """Sum over pairs of the energy of ``R_j R_i^T``. (S, N, 3, 3) -> (S,) float64; differentiable."""
+    relative = rotations[:, energies.j] @ rotations[:, energies.i].transpose(-1, -2)  # (S, P, 3, 3)
+    values = energies.at(torch.arange(energies.count), relative.transpose(0, 1))
+    return values.double().sum(0)
+
+
+def solve(
+    energies: PairEnergies, distributions: PairDistributions, settings: AscentSettings = AscentSettings()
+) -> JointSolutions:
+    """The joint maximum and the runners-up that were met on the way."""
+    rotations = _grow(energies, distributions, settings)
+    scores = joint_scores(energies, rotations)
+    keep = _distinct(rotations, scores, settings.starts, settings.distinct)
+    rotations, scores = rotations[keep], scores[keep]
+    done_rotations, done_scores = [], []
+    for sweep, radius in enumerate(settings.radii):
+        modes = distributions if sweep < 2 else None
+        rotations = _sweep(energies, modes, rotations, radius)
+        if sweep % settings.halving == settings.halving - 1 and len(rotations) > 1:
+            scores = joint_scores(energies, rotations)
+            keep = _distinct(rotations, scores, (len(rotations) + 1) // 2, settings.distinct)
+            rest = torch.ones(len(rotations), dtype=torch.bool)
+            rest[keep] = False
+            done_rotations.append(rotations[rest])
+            done_scores.append(scores[rest])
+            rotations = rotations[keep]
+    rotations = _polish(energies, rotations, math.radians(0.5), settings.polish_steps)
+    rotations = torch.cat([rotations, *done_rotations])
+    scores = torch.cat([joint_scores(energies, rotations[: len(rotations) - sum(map(len, done_scores))]), *done_scores])
+    keep = _distinct(rotations, scores, settings.starts, settings.distinct)
+    rotations, scores = rotations[keep], scores[keep]
+    return JointSolutions(rotations @ rotations[:, :1].transpose(-1, -2), scores)
+
+
+def spanning_order(strengths: torch.Tensor, pair_of: torch.Tensor) -> list[int]:
+    """Cameras in the order in which a maximum spanning tree reaches them from camera 0 (Prim).
+
+    Args:
+        strengths: (P,) of the pairs.
+        pair_of: (N, N) position of each pair.
+    """
+    table = strengths[pair_of].fill_diagonal_(-math.inf)
+    order = [0]
+    left = list(range(1, len(table)))
+    while left:
+        reach = [float(table[order, camera].max()) for camera in left]
+        order.append(left.pop(reach.index(max(reach))))
+    return order
+
+
+def _grow(energies: PairEnergies, distributions: PairDistributions, settings: AscentSettings) -> torch.Tensor:
+    """A beam of complete starts. -> (B, N, 3, 3)."""
+    order = spanning_order(distributions.mode_log_densities[:, 0], energies.pair_of)
+    beam = torch.eye(3, dtype=torch.float64).expand(1, energies.views, 3, 3).clone()
+    scores = torch.zeros(1, dtype=torch.float64)
+    for position in range(1, len(order)):
+        camera, placed = order[position], order[:position]
+        candidates = _mode_candidates(energies, distributions, beam, camera, placed)  # (B, C, 3, 3)
+        gains = _conditional(energies, beam, camera, placed, candidates)  # (B, C)
+        totals = (scores[:, None] + gains).flatten()
+        parents = torch.arange(len(beam)).repeat_interleave(candidates.shape[1])
+        grown = beam[parents]
+        grown[:, camera] = candidates.flatten(0, 1)
+        keep = _distinct(grown[:, order[: position + 1]], totals, settings.beam, settings.distinct)
+        beam, scores = grown[keep], totals[keep]
+    return beam
+
+
+def _mode_candidates(
+    energies: PairEnergies,
+    distributions: PairDistributions,
+    rotations: torch.Tensor,
+    camera: int,
+    others: list[int],
+) -> torch.Tensor:
+    """Where the modes of its pairs with the others would put a camera. (S, N, 3, 3) -> (S, C, 3, 3)."""
+    parts = []
+    for other in others:
+        pair = int(energies.pair_of[camera, other])
+        modes = distributions.modes[pair][distributions.mode_energies[pair] > -math.inf]
+        camera_from_other = modes if camera > other else modes.transpose(-1, -2)
+        parts.append(camera_from_other @ rotations[:, other, None])
+    return torch.cat(parts, 1)
+
+
+def _conditional(
+    energies: PairEnergies, rotations: torch.Tensor, camera: int, others: list[int], candidates: torch.Tensor
+) -> torch.Tensor:
+    """Energy of one camera's pairs at each candidate, the others held. (S, N, 3, 3), (S, C, 3, 3) -> (S, C)."""
+    pairs = energies.pair_of[camera, others]
+    placed = rotations[:, others].transpose(0, 1)[:, :, None]  # (O, S, 1, 3, 3)
+    relative = candidates @ placed.transpose(-1, -2)  # (O, S, C, 3, 3): camera from other
+    forward = torch.tensor([camera > other for other in others])[:, None, None, None, None]
+    relative = torch.where(forward, relative, relative.transpose(-1, -2))
+    return energies.at(pairs, relative.flatten(1, 2)).double().sum(0).view(candidates.shape[:2])
+
+
+def _distinct(rotations: torch.Tensor, scores: torch.Tensor, count: int, angle: float) -> torch.Tensor:
+    """Positions of the best solutions of which no two agree in all cameras. (S, N, 3, 3), (S,) -> (<= count,)."""
+    least_trace = 1 + 2 * math.cos(angle)
+    flat = (rotations @ rotations[:, :1].transpose(-1, -2)).flatten(2)  # (S, N, 9)
+    left = scores.clone()
+    keep: list[int] = []
+    while len(keep) < count:
+        best = int(left.argmax())
+        if left[best] == -math.inf:
+            break
+        keep.append(best)
+        traces = (flat * flat[best]).sum(-1).min(1).values
+        left = left.masked_fill(traces > least_trace, -math.inf)
+        left[best] = -math.inf
+    return torch.tensor(keep)
+
+
+def _neighbourhood() -> torch.Tensor:
+    """Tangent offsets inside the unit ball: 26 directions at its edge, the six axes at half of it. -> (33, 3)."""
+    axis = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
+    cube = torch.cartesian_prod(axis, axis, axis)
+    length = cube.norm(dim=1, keepdim=True)
+    edge = cube[length[:, 0] > 0] / length[length[:, 0] > 0]
+    axes = cube[(length[:, 0] > 0) & (length[:, 0] < 1.1)] / 2
+    return torch.cat([torch.zeros(1, 3, dtype=torch.float64), edge, axes])
+
+
+NEIGHBOURHOOD = _neighbourhood()
+
+
+def _sweep(
+    energies: PairEnergies, distributions: PairDistributions | None, rotations: torch.Tensor, radius: float
+) -> torch.Tensor:
+    """Moves every camera in turn to the best of its candidates. (S, N, 3, 3) -> (S, N, 3, 3)."""
+    rotations = rotations.clone()
+    offsets = so3.exp_tensor(NEIGHBOURHOOD * radius)  # the first is the identity: no camera gets worse
+    rows = torch.arange(len(rotations))
+    for camera in range(energies.views):
+        others = [other for other in range(energies.views) if other != camera]
+        candidates = offsets @ rotations[:, camera, None]
+        if distributions is not None:
+            modes = _mode_candidates(energies, distributions, rotations, camera, others)
+            candidates = torch.cat([candidates, modes], 1)
+        gains = _conditional(energies, rotations, camera, others, candidates)
+        rotations[:, camera] = candidates[rows, gains.argmax(1)]
+    return rotations
+
+
+def _polish(energies: PairEnergies, rotations: torch.Tensor, stride: float, steps: int) -> torch.Tensor:
+    """Climbs all rotations together along the joint gradient (Adam's scaling, best point kept)."""
+    here, best = rotations, rotations
+    best_score = torch.full((len(rotations),), -math.inf, dtype=torch.float64)
+    first = torch.zeros(*rotations.shape[:2], 3, dtype=torch.float64)
+    second = torch.zeros_like(first)
+    for step in range(steps + 1):
+        with torch.enable_grad():
+            tangent = torch.zeros_like(first, requires_grad=True)
+            scores = joint_scores(energies, so3.exp_tensor(tangent) @ here)
+            (slope,) = torch.autograd.grad(scores.sum(), tangent)
+        scores = scores.detach()
+        better = scores > best_score
+        best = torch.where(better[:, None, None, None], here, best)
+        best_score = torch.where(better, scores, best_score)
+        first = 0.8 * first + 0.2 * slope
+        second = 0.95 * second + 0.05 * slope**2
+        scale = (first / (1 - 0.8 ** (step + 1))) / ((second / (1 - 0.95 ** (step + 1))).sqrt() + 1e-9)
+        here = so3.exp_tensor(stride * (1 - step / steps) * scale) @ here
+    return best

@@ -1,0 +1,180 @@
+"""The distribution of every pair's relative rotation, found coarse to fine on the nested rotation grid.
+
+The energies of a pair are evaluated on all cells of a coarse level; the best cells are split into their
+eight children, and so on down. What remains is a partition of SO(3), fine where the pair is likely and
+coarse where it is not: a quadrature of the normalised distribution, and the place to look for its modes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from relpose_ros.geometry import so3, so3_grid
+from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How the grid is searched; `benchmarks/solver.py --search-table` prints what each choice costs and finds."""
+
+    level: int = 1
+    """The level evaluated in full: 72 * 8^level cells a pair, 30 degrees apart at level 1."""
+    widths: tuple[int, ...] = (64, 64)
+    """Cells split at that level and at each one below it."""
+    modes: int = 4
+    """Modes looked for a pair."""
+    separation: float = math.radians(25)
+    """Modes nearer than this are one, rad: the cells of the coarse level are that far apart."""
+    refinement_steps: int = 12
+    """Gradient steps a mode; each halves its stride when it overshoots."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairDistributions:
+    """Distributions of P pairs, each on its own partition of SO(3) into L cells. Tensors are float64."""
+
+    rotations: torch.Tensor
+    """(P, L, 3, 3) cell centres, camera_j_from_camera_i."""
+    energies: torch.Tensor
+    """(P, L) as the network gives them, before any temperature."""
+    log_volumes: torch.Tensor
+    """(L,) log of the share of SO(3) that a cell fills; the same for every pair."""
+    spacings: torch.Tensor
+    """(L,) edge of a cell, rad."""
+    modes: torch.Tensor
+    """(P, M, 3, 3) local maxima, highest energy first."""
+    mode_energies: torch.Tensor
+    """(P, M); -inf where a pair has fewer modes."""
+
+    def log_normaliser(self, temperature: float = 1.0) -> torch.Tensor:
+        """Log of the mean of exp(energy / temperature) over SO(3). -> (P,)."""
+        return torch.logsumexp(self.energies / temperature + self.log_volumes, -1)
+
+    def masses(self, temperature: float = 1.0) -> torch.Tensor:
+        """Probability of each cell; every row sums to one. -> (P, L)."""
+        return torch.softmax(self.energies / temperature + self.log_volumes, -1)
+
+    @cached_property
+    def mode_log_densities(self) -> torch.Tensor:
+        """Log density of each mode relative to uniform, at temperature one: comparable between pairs. -> (P, M)."""
+        return self.mode_energies - self.log_normaliser()[:, None]
+
+
+def search(
+    energies: PairEnergies, grid: GridEmbeddings, settings: SearchSettings = SearchSettings()
+) -> PairDistributions:
+    """Evaluates every pair coarse to fine and refines its modes."""
+    level = settings.level
+    cells = torch.arange(so3_grid.size(level)).expand(energies.count, -1)
+    values = energies.on_grid(grid(level))
+    kept: list[tuple[int, torch.Tensor, torch.Tensor]] = []
+    for width in settings.widths:
+        values, order = torch.sort(values, dim=1, descending=True, stable=True)
+        cells = torch.gather(cells, 1, order)
+        kept.append((level, cells[:, width:], values[:, width:]))
+        cells = (cells[:, :width, None] * 8 + torch.arange(8)).flatten(1)
+        level += 1
+        values = energies.on_cells(grid(level), cells)
+    kept.append((level, cells, values))
+
+    rotations = torch.cat([_grid_tensor(at)[index] for at, index, _ in kept], 1)
+    scores = torch.cat([value for _, _, value in kept], 1).double()
+    volumes = torch.cat([torch.full((len(c[0]),), -math.log(so3_grid.size(at))) for at, c, _ in kept]).double()
+    spacings = torch.cat([torch.full((len(c[0]),), so3_grid.cell_spacing(at)) for at, c, _ in kept]).double()
+    modes, mode_energies = _peaks(rotations, scores, settings)
+    modes, mode_energies = _refine_modes(energies, modes, mode_energies, so3_grid.cell_spacing(level), settings)
+    return PairDistributions(rotations, scores, volumes, spacings, modes, mode_energies)
+
+
+def _grid_tensor(level: int) -> torch.Tensor:
+    return torch.from_numpy(np.array(so3_grid.grid(level)))
+
+
+def _peaks(
+    rotations: torch.Tensor, energies: torch.Tensor, settings: SearchSettings
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The highest cells that lie at least `separation` apart. -> (P, M, 3, 3), (P, M)."""
+    least_trace = 1 + 2 * math.cos(settings.separation)
+    flat = rotations.flatten(2)  # (P, L, 9): the trace of A B^T is their scalar product
+    left = energies.clone()
+    rows = torch.arange(len(flat))
+    peaks, values = [], []
+    for _ in range(settings.modes):
+        best = left.argmax(1)
+        peaks.append(rotations[rows, best])
+        values.append(left[rows, best])
+        traces = torch.einsum("pla,pa->pl", flat, flat[rows, best])
+        left = left.masked_fill(traces > least_trace, -math.inf)
+    return torch.stack(peaks, 1), torch.stack(values, 1)
+
+
+def _refine_modes(
+    energies: PairEnergies,
+    modes: torch.Tensor,
+    values: torch.Tensor,
+    spacing: float,
+    settings: SearchSettings,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    count = modes.shape[1]
+    pairs = torch.arange(energies.count).repeat_interleave(count)
+    refined, best = ascend(
+        energies, pairs, modes.flatten(0, 1), stride=spacing / 2, steps=settings.refinement_steps
+    )
+    refined, best = refined.view_as(modes), best.view_as(values).masked_fill(values == -math.inf, -math.inf)
+    best, order = torch.sort(best, dim=1, descending=True, stable=True)
+    refined = torch.gather(refined, 1, order[..., None, None].expand_as(refined))
+    # Two starts may have climbed the same hill: the lower one is no mode of its own.
+    traces = torch.einsum("pmab,pnab->pmn", refined, refined)
+    same = torch.tril(traces > 1 + 2 * math.cos(settings.separation), diagonal=-1).any(-1)
+    best = best.masked_fill(same, -math.inf)
+    best, order = torch.sort(best, dim=1, descending=True, stable=True)
+    return torch.gather(refined, 1, order[..., None, None].expand_as(refined)), best
+
+
+def ascend(
+    energies: PairEnergies, pairs: torch.Tensor, rotations: torch.Tensor, stride: float, steps: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Climbs the energy of each pair along its gradient on the tangent space.
+
+    The stride grows while the energy does and halves where it would not: such energies have ripples of
+    any steepness, so that the gradient's direction is trusted and its length is not.
+
+    Args:
+        energies: of the scan.
+        pairs: (Q,) int64, which pair each rotation belongs to.
+        rotations: (Q, 3, 3) float64 starts.
+        stride: first step, rad.
+        steps: how many.
+
+    Returns:
+        Rotations (Q, 3, 3) and energies (Q,), none lower than at the start.
+    """
+    here = rotations
+    value, slope = _slope(energies, pairs, here)
+    length = torch.full_like(value, stride)
+    for _ in range(steps):
+        direction = slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        there = so3.exp_tensor(direction * length[:, None]) @ here
+        new_value, new_slope = _slope(energies, pairs, there)
+        better = new_value > value
+        here = torch.where(better[:, None, None], there, here)
+        slope = torch.where(better[:, None], new_slope, slope)
+        value = torch.where(better, new_value, value)
+        length = torch.where(better, length * 1.2, length * 0.4)
+    return here, value
+
+
+def _slope(
+    energies: PairEnergies, pairs: torch.Tensor, rotations: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Energies (Q,) and their gradients (Q, 3) for left perturbations of the rotations."""
+    with torch.enable_grad():
+        tangent = torch.zeros(len(rotations), 3, dtype=torch.float64, requires_grad=True)
+        value = energies.at(pairs, (so3.exp_tensor(tangent) @ rotations)[:, None])[:, 0]
+        (slope,) = torch.autograd.grad(value.sum(), tangent)
+    return value.detach().double(), slope

@@ -1,0 +1,215 @@
+"""How far to trust an estimate: what each pair knows, each camera's covariance, and how they agree."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from relpose_ros.estimates import Evidence, Mode, PairRotation
+from relpose_ros.geometry import so3
+from relpose_ros.inference.global_rotations import NEIGHBOURHOOD
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from relpose_ros.inference.calibration import Calibration
+    from relpose_ros.inference.global_rotations import JointSolutions
+    from relpose_ros.inference.pair_distribution import PairDistributions
+    from relpose_ros.inference.pair_energies import PairEnergies
+
+    FloatArray = npt.NDArray[np.float64]
+
+WITHIN = math.radians(15)
+"""The radius of "within 15 degrees", the field's usual measure of a right rotation."""
+BASIN = math.radians(30)
+"""A mode owns the probability nearer to it than to any other mode, up to this angle: beyond it lies what no
+mode explains, so that a flat distribution has modes of hardly any weight."""
+LEAST_WEIGHT = 0.02
+"""Modes below it are not reported: they are ripples."""
+RUNNER_UP_WEIGHT = 0.15
+"""A second mode matters from here on: about one chance in seven of being the true one."""
+FLOOR = math.radians(0.1)
+"""The solver's own accuracy, rad, and the standard deviation stated for what the gauge fixes by definition."""
+UNIFORM_VARIANCE = (math.pi**2 / 3 + 2) / 3
+"""Per axis, rad^2, of the rotation vector of a uniformly random rotation: the most that can be unknown."""
+CURVATURE_RADIUS = math.radians(6)
+"""Neighbourhood over which an energy's curvature is measured: above the ripples, below a mode's width."""
+
+
+def describe_pairs(
+    distributions: PairDistributions,
+    energies: PairEnergies,
+    solution: torch.Tensor,
+    calibration: Calibration,
+) -> tuple[PairRotation, ...]:
+    """Every pair's modes, spread and entropy, and how the final rotations agree with it.
+
+    Args:
+        distributions: of the P pairs.
+        energies: which views a pair is of.
+        solution: (N, 3, 3) float64 camera_from_object.
+        calibration: of the network.
+    """
+    solved = solution[energies.j] @ solution[energies.i].transpose(-1, -2)
+    masses = distributions.masses(calibration.temperature)
+    entropies = -(masses * (masses.clamp_min(1e-300).log() - distributions.log_volumes)).sum(1)
+    pairs = []
+    for pair in range(energies.count):
+        mass = masses[pair]
+        found = distributions.mode_energies[pair] > -math.inf
+        centres = distributions.modes[pair][found]
+        angles = _angles(distributions.rotations[pair], centres)  # (L, M)
+        nearest = angles.argmin(1)
+        owned = _inside(angles.min(1).values, BASIN, distributions.spacings) * mass
+        weights = torch.stack([owned[nearest == mode].sum() for mode in range(len(centres))])
+        by_weight = torch.argsort(weights, descending=True, stable=True)
+        strongest = int(by_weight[0])
+        modes = tuple(
+            Mode(
+                camera_j_from_camera_i=centres[mode].numpy(),
+                weight=float(weights[mode]),
+                covariance=_second_moment(
+                    distributions, pair, centres[mode], torch.where(nearest == mode, owned, torch.zeros_like(owned))
+                )
+                * calibration.pair_spread,
+            )
+            for mode in by_weight.tolist()
+            if mode == strongest or weights[mode] >= LEAST_WEIGHT
+        )
+        ambiguous = len(modes) > 1 and modes[1].weight >= RUNNER_UP_WEIGHT
+        to_solution = _angles(distributions.rotations[pair], solved[pair : pair + 1])[:, 0]
+        pairs.append(
+            PairRotation(
+                i=int(energies.i[pair]),
+                j=int(energies.j[pair]),
+                camera_j_from_camera_i=modes[0].camera_j_from_camera_i,
+                covariance=_second_moment(distributions, pair, centres[strongest], mass) * calibration.pair_spread,
+                entropy=float(entropies[pair]),
+                probability_within_15_deg=_share(angles[:, strongest], mass, distributions.spacings),
+                modes=modes,
+                ambiguous=ambiguous,
+                ambiguity_angle=_angle(modes[0], modes[1]) if ambiguous else 0.0,
+                solution_probability=_share(to_solution, mass, distributions.spacings),
+                solution_angle=float(_angles(solved[pair : pair + 1], centres).min()),
+                evidence=Evidence.LEARNED,
+            )
+        )
+    return tuple(pairs)
+
+
+def _angle(a: Mode, b: Mode) -> float:
+    return float(so3.angle_between(a.camera_j_from_camera_i, b.camera_j_from_camera_i))
+
+
+def _angles(rotations: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+    """Angles in rad. (L, 3, 3), (M, 3, 3) -> (L, M)."""
+    traces = rotations.flatten(1) @ centres.flatten(1).T
+    return ((traces - 1) / 2).clamp(-1, 1).acos()
+
+
+def _inside(angles: torch.Tensor, radius: float, spacings: torch.Tensor) -> torch.Tensor:
+    """Which share of each cell lies within a radius of a rotation, its border taken as straight. (L,) -> (L,)."""
+    return ((radius - angles) / spacings + 0.5).clamp(0, 1)
+
+
+def _share(angles: torch.Tensor, mass: torch.Tensor, spacings: torch.Tensor) -> float:
+    return float((_inside(angles, WITHIN, spacings) * mass).sum())
+
+
+def _second_moment(
+    distributions: PairDistributions, pair: int, centre: torch.Tensor, mass: torch.Tensor
+) -> FloatArray:
+    """Of the rotation vector from ``centre``, left perturbation, over the given masses. -> (3, 3) rad^2."""
+    used = mass > 1e-9 * mass.max()  # logarithms of the rest would be most of the work for nothing
+    share = (mass[used] / mass[used].sum()).numpy()
+    vectors = so3.log((distributions.rotations[pair][used] @ centre.T).numpy())
+    inside_cells = float((distributions.spacings[used].numpy() ** 2 * share).sum()) / 12
+    return np.asarray(np.einsum("l,la,lb->ab", share, vectors, vectors) + inside_cells * np.eye(3))
+
+
+def camera_covariances(
+    energies: PairEnergies,
+    solutions: JointSolutions,
+    translations: FloatArray,
+    calibration: Calibration,
+) -> FloatArray:
+    """Covariance of every camera in the object frame, as geometry_msgs/PoseWithCovariance orders it.
+
+    The rotations' part is the inverse of the joint energy's curvature at the best solution, plus the spread
+    over the other solutions, each by its probability. Every view takes part in N - 1 pairs, whose errors are
+    therefore not N - 1 independent ones: the joint energy is divided by N / 2, which is exact where each
+    view has one error of its own.
+
+    Args:
+        energies: of the scan.
+        solutions: joint maxima, best first.
+        translations: (N, 3) camera_from_object, in units of the first camera's distance.
+        calibration: of the network.
+
+    Returns:
+        (N, 6, 6): x, y, z, rotation about X, Y, Z, fixed axes of the object frame.
+    """
+    temperature = calibration.temperature * energies.views / 2
+    best = solutions.rotations[0]
+    information = _joint_information(energies, best, temperature)
+    spread = np.linalg.inv(information) * calibration.camera_spread
+    chances = torch.softmax(solutions.scores / temperature, 0).numpy()
+    offsets = so3.log((solutions.rotations @ best.transpose(-1, -2)).numpy())  # (S, N, 3), camera axes
+    rotations = best.numpy()
+    sigma = np.array(calibration.translation_sigma)
+    covariances = np.empty((energies.views, 6, 6))
+    for camera in range(energies.views):
+        if camera == 0:
+            rotation_part = FLOOR**2 * np.eye(3)
+            # By definition of the unit of length its distance is one.
+            direction = translations[0] / np.linalg.norm(translations[0])
+            across = np.eye(3) - np.outer(direction, direction)
+            translation_part = across @ np.diag(sigma**2) @ across + FLOOR**2 * np.eye(3)
+        else:
+            block = spread[3 * camera - 3 : 3 * camera, 3 * camera - 3 : 3 * camera]
+            others = np.einsum("s,sa,sb->ab", chances, offsets[:, camera], offsets[:, camera])
+            rotation_part = block + others + FLOOR**2 * np.eye(3)
+            translation_part = np.diag(sigma**2)
+        object_from_camera = rotations[camera].T
+        # A turn e of the camera (axes of the camera, left perturbation of camera_from_object) is the turn
+        # -R^T e in the object's axes, and moves the centre -R^T t by -R^T (t x e).
+        turn = np.concatenate([-object_from_camera @ so3.hat(translations[camera]), -object_from_camera])
+        covariances[camera] = turn @ rotation_part @ turn.T
+        covariances[camera, :3, :3] += object_from_camera @ translation_part @ object_from_camera.T
+    return (covariances + covariances.transpose(0, 2, 1)) / 2
+
+
+def _joint_information(energies: PairEnergies, rotations: torch.Tensor, temperature: float) -> FloatArray:
+    """Curvature of the tempered joint energy in the cameras' own axes, the first camera held.
+
+    With R_ij = R_j R_i^T, turns e_i and e_j of the cameras turn R_ij by e_j - R_ij e_i. -> (3 N - 3, 3 N - 3).
+    """
+    relative = rotations[energies.j] @ rotations[energies.i].transpose(-1, -2)
+    curvatures = _curvatures(energies, relative) / temperature
+    information = np.eye(3 * energies.views) / UNIFORM_VARIANCE
+    for pair, (i, j) in enumerate(zip(energies.i.tolist(), energies.j.tolist(), strict=True)):
+        jacobian = np.zeros((3, 3 * energies.views))
+        jacobian[:, 3 * i : 3 * i + 3] = -relative[pair].numpy()
+        jacobian[:, 3 * j : 3 * j + 3] = np.eye(3)
+        information += jacobian.T @ curvatures[pair] @ jacobian
+    return information[3:, 3:]
+
+
+def _curvatures(energies: PairEnergies, relative: torch.Tensor) -> FloatArray:
+    """Minus the second derivative of each pair's energy, of a quadratic fitted around; never negative.
+
+    Fitted over a neighbourhood instead of differentiated at a point, because the energies are piecewise
+    linear in places and rippled in others. (P, 3, 3) -> (P, 3, 3).
+    """
+    offsets = NEIGHBOURHOOD * CURVATURE_RADIUS
+    around = so3.exp_tensor(offsets) @ relative[:, None]
+    values = energies.at(torch.arange(energies.count), around).double().numpy()
+    x, y, z = offsets.numpy().T
+    design = np.stack([np.ones_like(x), x, y, z, x * x / 2, y * y / 2, z * z / 2, x * y, x * z, y * z], 1)
+    xx, yy, zz, xy, xz, yz = (values @ np.linalg.pinv(design).T)[:, 4:].T
+    hessian = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
+    sizes, axes = np.linalg.eigh(-hessian)
+    return np.asarray(np.einsum("pab,pb,pcb->pac", axes, np.maximum(sizes, 0), axes))

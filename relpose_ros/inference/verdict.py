@@ -1,0 +1,81 @@
+"""Whether a scan is enough to act on, in a number for a planner and in words for a person."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from relpose_ros.estimates import Verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy.typing as npt
+
+    from relpose_ros.estimates import PairRotation
+
+TRUSTED = 0.6
+"""A pair is trusted when this much of its probability lies within 15 degrees of the final poses: more likely
+right than wrong with a margin, and impossible for a pair with two equal modes."""
+LARGEST_DEVIATION = math.radians(12)
+"""Largest standard deviation (worst axis) of a camera's rotation: within 15 degrees more often than not."""
+
+
+def judge(
+    pairs: Sequence[PairRotation], covariances: npt.NDArray[np.float64], calibrated: bool
+) -> tuple[Verdict, int, str]:
+    """The verdict, the weakest pair's position and the verdict in words.
+
+    ENOUGH asks for three things: a chain of trusted pairs from every camera to the first, a small covariance
+    of every camera, and calibrated probabilities, without which the first two mean nothing. Views are named
+    by their position in the scan, from 0, as in the messages.
+
+    Args:
+        pairs: of all N views.
+        covariances: (N, 6, 6) of the cameras.
+        calibrated: whether the probabilities were calibrated.
+    """
+    deviations = np.sqrt(np.linalg.eigvalsh(covariances[:, 3:, 3:])[:, -1])
+    tied = _tied(pairs, len(covariances))
+    if all(tied) and deviations.max() <= LARGEST_DEVIATION:
+        weakest = min(range(len(pairs)), key=lambda p: _certainty(pairs[p]))
+        if calibrated:
+            trusted = sum(pair.solution_probability >= TRUSTED for pair in pairs)
+            worst = math.degrees(deviations.max())
+            return (
+                Verdict.ENOUGH,
+                weakest,
+                f"enough: {trusted} of {len(pairs)} pairs agree, rotations to about {worst:.0f} degrees",
+            )
+        reason = "these weights are not calibrated, so that none of their estimates can be called enough"
+        return Verdict.ONE_MORE_VIEW, weakest, f"one more view: {reason}"
+    loose = [camera for camera, is_tied in enumerate(tied) if not is_tied] or [int(deviations.argmax())]
+    blocking = [p for p, pair in enumerate(pairs) if pair.i in loose or pair.j in loose]
+    weakest = min(blocking, key=lambda p: _certainty(pairs[p]))
+    return Verdict.ONE_MORE_VIEW, weakest, f"one more view: {_weakness(pairs[weakest])}"
+
+
+def _certainty(pair: PairRotation) -> float:
+    return min(pair.probability_within_15_deg, pair.solution_probability)
+
+
+def _weakness(pair: PairRotation) -> str:
+    name = f"pair {pair.i}-{pair.j}"
+    if pair.ambiguous:
+        return f"{name} is ambiguous by about {10 * round(math.degrees(pair.ambiguity_angle) / 10)} degrees"
+    if pair.probability_within_15_deg >= TRUSTED:
+        return f"{name} contradicts the others by about {math.degrees(pair.solution_angle):.0f} degrees"
+    chance = 100 * pair.probability_within_15_deg
+    return f"{name} knows its rotation to 15 degrees with {chance:.0f}% only"
+
+
+def _tied(pairs: Sequence[PairRotation], views: int) -> list[bool]:
+    """Which cameras a chain of trusted pairs ties to the first."""
+    tied = [camera == 0 for camera in range(views)]
+    for _ in range(views):
+        for pair in pairs:
+            if pair.solution_probability >= TRUSTED and (tied[pair.i] or tied[pair.j]):
+                tied[pair.i] = tied[pair.j] = True
+    return tied
