@@ -52,7 +52,7 @@ def align_points(source: npt.ArrayLike, target: npt.ArrayLike) -> Similarity:
 def align_rotations(estimate: npt.ArrayLike, truth: npt.ArrayLike) -> FloatArray:
     """The rotation Q of the world that brings ``estimate_i @ Q`` closest to ``truth_i`` (chordal).
 
-    Both (N, 3, 3) camera_from_world, each in a world of its own: Q is estimate_world_from_truth_world. -> (3, 3).
+    Both (N, 3, 3) camera_from_world, each in a world of its own: Q, (3, 3), is estimate_from_truth_world.
     """
     e, t = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
     return so3.project(np.einsum("nji,njk->ik", e, t))
@@ -74,6 +74,7 @@ def align_translations(
         s and c (3,).
     """
     wanted = np.asarray(estimate, np.float64).reshape(-1)
-    t, r = np.asarray(truth, np.float64).reshape(-1, 1), np.asarray(camera_from_world, np.float64).reshape(-1, 3)
+    t = np.asarray(truth, np.float64).reshape(-1, 1)
+    r = np.asarray(camera_from_world, np.float64).reshape(-1, 3)
     solution, *_ = np.linalg.lstsq(np.concatenate([t, r], 1), wanted, rcond=None)
     return float(solution[0]), np.asarray(solution[1:])

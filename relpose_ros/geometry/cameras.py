@@ -31,9 +31,9 @@ def translation_of(camera_from_world: npt.ArrayLike, centre: npt.ArrayLike) -> F
 
 
 def look_at(centre: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
-    """camera_from_world of a camera at ``centre`` whose axis passes through ``target``, image top towards ``up``.
+    """camera_from_world of a camera at ``centre`` looking at ``target``, the top of its image towards ``up``.
 
-    (..., 3) each -> (..., 3, 3). A camera that looks along ``up`` has no preferred roll and gets an arbitrary one.
+    (..., 3) each -> (..., 3, 3). A camera that looks along ``up`` has no preferred roll and gets any.
     """
     c, p = np.broadcast_arrays(np.asarray(centre, np.float64), np.asarray(target, np.float64))
     forward = p - c
@@ -47,7 +47,10 @@ def look_at(centre: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0
 
 
 def project_points(
-    points: npt.ArrayLike, camera_from_world: npt.ArrayLike, translation: npt.ArrayLike, intrinsics: Intrinsics
+    points: npt.ArrayLike,
+    camera_from_world: npt.ArrayLike,
+    translation: npt.ArrayLike,
+    intrinsics: Intrinsics,
 ) -> FloatArray:
     """Pixels (corner convention of `relpose_ros.views`) of world points in one camera. (M, 3) -> (M, 2).
 

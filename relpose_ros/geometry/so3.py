@@ -59,7 +59,7 @@ def exp_tensor(rotation_vector: torch.Tensor) -> torch.Tensor:
     """Torch twin of `exp`, differentiable at zero too. (..., 3) -> (..., 3, 3)."""
     square = (rotation_vector * rotation_vector).sum(-1)[..., None, None]
     small = square < 1e-6
-    angle = torch.where(small, torch.ones_like(square), square).sqrt()  # no sqrt at zero: its slope is infinite
+    angle = torch.where(small, torch.ones_like(square), square).sqrt()  # never of zero: infinite slope
     first = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
     second = torch.where(small, 0.5 - square / 24, 2 * (torch.sin(angle / 2) / angle) ** 2)
     x, y, z = rotation_vector.unbind(-1)

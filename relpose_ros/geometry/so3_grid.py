@@ -57,7 +57,9 @@ def cell_rotations(level: int, cells: npt.ArrayLike) -> FloatArray:
     """Centres of the given cells of a level. (K,) indices -> (K, 3, 3)."""
     rest = np.asarray(cells, np.int64)
     if rest.size and not (rest.min() >= 0 and rest.max() < size(level)):
-        raise ValueError(f"Level {level} of the rotation grid has {size(level)} cells; an index is outside them.")
+        raise ValueError(
+            f"Level {level} of the rotation grid has {size(level)} cells; an index lies outside."
+        )
     column, row, tilt = np.zeros_like(rest), np.zeros_like(rest), np.zeros_like(rest)
     for bit in range(level):
         digit = rest & 7
@@ -95,7 +97,7 @@ def _pixel_centre(
 
 
 def _from_hopf(azimuth: FloatArray, height: FloatArray, turn: FloatArray) -> FloatArray:
-    """``Rz(azimuth) Ry(polar angle) Rz(turn)``: where the z axis goes, and how far it is turned about itself."""
+    """``Rz(azimuth) Ry(polar angle) Rz(turn)``: where the z axis goes, and its turn about itself."""
     c, s = height, np.sqrt(np.maximum(0, 1 - height * height))
     ca, sa, ct, st = np.cos(azimuth), np.sin(azimuth), np.cos(turn), np.sin(turn)
     rows = [

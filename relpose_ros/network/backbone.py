@@ -1,0 +1,131 @@
+"""Anti-aliased residual network with group norm (R. Zhang, ICML 2019; He et al. 2016).
+
+Every reduction of resolution is a convolution with stride 1 followed by a blur with stride 2.
+Module and attribute names are those of the released checkpoints.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+if TYPE_CHECKING:
+    from relpose_ros.network.presets import Preset
+
+
+def group_norm(channels: int) -> nn.GroupNorm:
+    """The group norm that takes the place of a batch norm: 8 to 32 groups, by width."""
+    return nn.GroupNorm(min(32, max(8, channels // 16)), channels)
+
+
+class Blur(nn.Module):
+    """Binomial filter (1, 3, 3, 1) with stride 2, edges reflected. (B, C, 2h, 2w) to (B, C, h, w)."""
+
+    filt: torch.Tensor
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        taps = torch.tensor([1.0, 3.0, 3.0, 1.0]) / 8
+        self.register_buffer("filt", torch.outer(taps, taps).expand(channels, 1, 4, 4).clone())
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Blur and halve."""
+        padded = functional.pad(x, (1, 2, 1, 2), mode="reflect")
+        return functional.conv2d(padded, self.filt, stride=2, groups=len(self.filt))
+
+
+def _convolution(inside: int, outside: int, size: int, *, halve: bool = False) -> nn.Module:
+    convolution = nn.Conv2d(inside, outside, size, padding=size // 2, bias=False)
+    return nn.Sequential(Blur(inside), convolution) if halve else convolution
+
+
+def _shortcut(inside: int, outside: int, *, halve: bool) -> nn.Sequential | None:
+    if not halve and inside == outside:
+        return None
+    blur = [Blur(inside)] if halve else []
+    return nn.Sequential(*blur, nn.Conv2d(inside, outside, 1, bias=False), group_norm(outside))
+
+
+class Bottleneck(nn.Module):
+    """Residual block 1x1, 3x3, 1x1, four times as wide outside as inside."""
+
+    expansion = 4
+
+    def __init__(self, inside: int, width: int, *, halve: bool) -> None:
+        super().__init__()
+        outside = width * self.expansion
+        self.conv1 = _convolution(inside, width, 1)
+        self.bn1 = group_norm(width)
+        self.conv2 = _convolution(width, width, 3)
+        self.bn2 = group_norm(width)
+        self.conv3 = _convolution(width, outside, 1, halve=halve)
+        self.bn3 = group_norm(outside)
+        self.downsample = _shortcut(inside, outside, halve=halve)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(B, inside, h, w) -> (B, outside, h, w), or half of h and w."""
+        residual = functional.relu(self.bn1(self.conv1(x)))
+        residual = functional.relu(self.bn2(self.conv2(residual)))
+        residual = self.bn3(self.conv3(residual))
+        return functional.relu(residual + (x if self.downsample is None else self.downsample(x)))
+
+
+class BasicBlock(nn.Module):
+    """Residual block 3x3, 3x3: fewer and narrower maps than a bottleneck, which is what a CPU waits for."""
+
+    expansion = 1
+
+    def __init__(self, inside: int, width: int, *, halve: bool) -> None:
+        super().__init__()
+        self.conv1 = _convolution(inside, width, 3)
+        self.bn1 = group_norm(width)
+        self.conv2 = _convolution(width, width, 3, halve=halve)
+        self.bn2 = group_norm(width)
+        self.downsample = _shortcut(inside, width, halve=halve)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(B, inside, h, w) -> (B, width, h, w), or half of h and w."""
+        residual = functional.relu(self.bn1(self.conv1(x)))
+        residual = self.bn2(self.conv2(residual))
+        return functional.relu(residual + (x if self.downsample is None else self.downsample(x)))
+
+
+class Backbone(nn.Sequential):
+    """Stem (a quarter of the resolution), then stages, each of half the resolution of the one before."""
+
+    def __init__(self, preset: Preset) -> None:
+        block: type[Bottleneck | BasicBlock] = Bottleneck if preset.block == "bottleneck" else BasicBlock
+        stem = [
+            nn.Conv2d(3, preset.stem_width, 7, stride=2, padding=3, bias=False),
+            group_norm(preset.stem_width),
+            nn.ReLU(),
+            nn.Sequential(nn.MaxPool2d(2, stride=1), Blur(preset.stem_width)),
+        ]
+        stages = []
+        inside = preset.stem_width
+        self.widths = []
+        for stage, (width, depth) in enumerate(zip(preset.stage_widths, preset.stage_depths, strict=True)):
+            blocks = []
+            for position in range(depth):
+                blocks.append(block(inside, width, halve=stage > 0 and position == 0))
+                inside = width * block.expansion
+            stages.append(nn.Sequential(*blocks))
+            self.widths.append(inside)
+        super().__init__(*stem, *stages)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+
+    def stage_maps(self, images: torch.Tensor) -> list[torch.Tensor]:
+        """The map that leaves each stage. (B, 3, S, S) -> [(B, C_k, S / 2^(k+2), S / 2^(k+2))]."""
+        stem = len(self) - len(self.widths)
+        x = images.contiguous(memory_format=torch.channels_last)
+        maps = []
+        for position, layer in enumerate(self):
+            x = layer(x)
+            if position >= stem:
+                maps.append(x)
+        return maps

@@ -1,0 +1,89 @@
+"""What is read from tokens and maps: a pair's correlation, and numbers that a view regresses."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import nn
+
+if TYPE_CHECKING:
+    from relpose_ros.network.presets import CorrelationSettings
+
+
+class Regressor(nn.Module):
+    """Numbers from a view's token and the first view's: a perceptron with one residual step.
+
+    Its attribute names are those of the released translation head.
+    """
+
+    def __init__(self, token_width: int, widths: tuple[int, int], outputs: int) -> None:
+        super().__init__()
+        wide, narrow = widths
+        self.embed_feature = nn.Linear(2 * token_width, wide)
+        self.block1 = nn.Sequential(
+            nn.LeakyReLU(), nn.Linear(wide, wide), nn.LeakyReLU(), nn.Linear(wide, narrow)
+        )
+        self.block2 = nn.Sequential(
+            nn.LeakyReLU(), nn.Linear(narrow, narrow), nn.LeakyReLU(), nn.Linear(narrow, narrow)
+        )
+        self.decode = nn.Sequential(nn.LeakyReLU(), nn.Linear(narrow, outputs))
+
+    def forward(self, tokens: torch.Tensor, first: torch.Tensor) -> torch.Tensor:
+        """(..., D) and (..., D) of the first view -> (..., outputs)."""
+        hidden = self.block1(self.embed_feature(torch.cat([tokens, first], -1)))
+        out: torch.Tensor = self.decode(hidden + self.block2(hidden))
+        return out
+
+
+class CorrelationReader(nn.Module):
+    """What matches where between two views' descriptors, as one vector (see `CorrelationSettings`).
+
+    It depends on the order of the views, as the rotation does.
+    """
+
+    def __init__(self, settings: CorrelationSettings, width: int) -> None:
+        super().__init__()
+        self.side = settings.map_side
+        values, layout = settings.match_width, settings.layout_widths
+        quarter = (self.side // 4) ** 2
+        self.log_sharpness = nn.Parameter(torch.tensor(math.log(20.0)))
+        self.matched_at = nn.Parameter(_cosine_basis(self.side, values))
+        self.claimed_by = nn.Parameter(_cosine_basis(self.side, values))
+        self.read_layout = nn.Sequential(
+            nn.Conv2d(2 * values + 1, layout[0], 1),
+            nn.LeakyReLU(),
+            nn.Conv2d(layout[0], layout[0], 3, stride=2, padding=1),
+            nn.LeakyReLU(),
+            nn.Conv2d(layout[0], layout[1], 3, stride=2, padding=1),
+            nn.LeakyReLU(),
+            nn.Flatten(),
+            nn.Linear(layout[1] * quarter, settings.summary_width),
+            nn.LeakyReLU(),
+            nn.Linear(settings.summary_width, width),
+        )
+
+    def forward(self, maps_i: torch.Tensor, maps_j: torch.Tensor) -> torch.Tensor:
+        """Unit descriptors of views i and of views j, (P, C, h, w) each -> (P, width)."""
+        cosine = maps_i.flatten(2).transpose(1, 2) @ maps_j.flatten(2)  # (P, places of i, places of j)
+        # One exponential serves both softmaxes; below e^40 no row of it can vanish in float32.
+        likeness = ((cosine - 1) * self.log_sharpness.exp().clamp(max=40)).exp()
+        # Softmax over j's places: where a place of i is found. Softmax over i's: which places of j claim it.
+        found = likeness @ self.matched_at / likeness.sum(-1, keepdim=True)
+        claims = 1 / likeness.sum(-2)[..., None]  # (P, places of j, 1)
+        claimed = likeness @ torch.cat([self.claimed_by * claims, claims], -1)
+        places = torch.cat([found, claimed], -1)
+        layout = places.reshape(-1, self.side, self.side, places.shape[-1]).movedim(-1, 1)
+        out: torch.Tensor = self.read_layout(layout)
+        return out
+
+
+def _cosine_basis(side: int, count: int) -> torch.Tensor:
+    """The ``count`` smoothest non-constant cosine functions on a map of side x side places: (places, count).
+
+    Read through them, a match says where it is from the first step of training on.
+    """
+    waves = torch.cos(math.pi * torch.outer(torch.arange(side) + 0.5, torch.arange(side)) / side)
+    order = sorted((u + v, u, v) for u in range(side) for v in range(side))[1 : count + 1]
+    return torch.stack([torch.outer(waves[:, u], waves[:, v]).flatten() for _, u, v in order], -1)

@@ -1,0 +1,106 @@
+"""The sizes and switches of a network: everything in which one network differs from another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class CorrelationSettings:
+    """How two views' local features are compared and the result is read.
+
+    Descriptors have the resolution of one backbone stage and hear of the coarser ones. Each place of view i is
+    told where in view j it is found, as ``match_width`` learned functions of the place; convolutions read the
+    image of those.
+    """
+
+    stage: int
+    """Backbone stage (from 0) whose resolution the descriptors have."""
+    map_side: int
+    """Side of that map, in descriptors."""
+    descriptor_width: int
+    match_width: int
+    layout_widths: tuple[int, int]
+    summary_width: int
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A network in numbers. The defaults are the published RelPose++ (arXiv 2305.04926)."""
+
+    name: str
+    image_size: int = 224
+    """Side of a crop, pixels."""
+    crop_antialias: bool = False
+    """Whether a crop is low-pass filtered when it is shrunk."""
+    stem_width: int = 64
+    block: Literal["bottleneck", "basic"] = "bottleneck"
+    stage_widths: tuple[int, ...] = (64, 128, 256, 512)
+    stage_depths: tuple[int, ...] = (3, 4, 6, 3)
+    layout_width: int | None = None
+    """Channels kept at each place when the last map becomes a token; None: the plain average of the map."""
+    pooled_width: int = 2048
+    """Numbers that describe a view; with the encoded crop parameters they are its token."""
+    crop_frequencies: int = 8
+    rotation_frequencies: int = 8
+    max_views: int = 8
+    layers: int = 8
+    heads: int = 12
+    head_width: int = 64
+    feedforward_width: int = 1536
+    energy_width: int = 256
+    translation_widths: tuple[int, int] = (1024, 512)
+    correlation: CorrelationSettings | None = None
+
+    index_encoding: bool = True
+    """Whether a token knows the position of its view in the scan."""
+    pair_context: bool = False
+    """Whether the transformer sees only the two views of a pair at a time."""
+    rotation: Literal["energy", "regression"] = "energy"
+    """A distribution over each pair's rotation, or one rotation a view, as six numbers (Zhou et al. 2019)."""
+    translation_frame: Literal["look_at", "first_camera"] = "look_at"
+    """Origin of the world in which translations are predicted."""
+
+    @property
+    def crop_width(self) -> int:
+        """Numbers that encode the three crop parameters."""
+        return 3 * 2 * self.crop_frequencies
+
+    @property
+    def token_width(self) -> int:
+        """Width of a token."""
+        return self.pooled_width + self.crop_width
+
+
+PRESETS = {
+    "paper": Preset("paper"),
+    "compact": Preset(
+        "compact",
+        image_size=128,
+        crop_antialias=True,
+        stem_width=32,
+        block="basic",
+        stage_widths=(32, 64, 128, 256),
+        stage_depths=(1, 2, 2, 1),
+        layout_width=64,
+        pooled_width=232,
+        crop_frequencies=4,
+        rotation_frequencies=4,
+        layers=4,
+        heads=8,
+        head_width=32,
+        feedforward_width=512,
+        energy_width=128,
+        translation_widths=(256, 128),
+        correlation=CorrelationSettings(
+            stage=1,
+            map_side=16,
+            descriptor_width=64,
+            match_width=48,
+            layout_widths=(64, 96),
+            summary_width=256,
+        ),
+    ),
+}
+"""The two networks this package knows by name."""
