@@ -260,7 +260,7 @@ def _photo(folder: Path, entry: object, where: str) -> Photo:
 def _box(value: object, width: float, height: float, where: str) -> BoundingBox:
     edges = _array(value, (4,), "box", where)
     box = BoundingBox(*(float(edge) for edge in edges))
-    inside = 0 <= box.x0 and 0 <= box.y0 and box.x1 <= width and box.y1 <= height
+    inside = min(box.x0, box.y0) >= 0 and box.x1 <= width and box.y1 <= height
     if not inside or box.width <= 0 or box.height <= 0:
         text = (
             f"{where} has the box {edges.tolist()}, which is empty or not inside the image of "
@@ -292,7 +292,7 @@ def _camera_from_world(entry: dict[str, Any], where: str) -> FloatArray | None:
     rotation = pose[:, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        text = f"{where} has a camera_from_world whose left 3x3 part is no rotation (R R^T is off by {error:.2g})."
+        text = f"{where} has a camera_from_world whose left 3x3 is no rotation (R R^T is off by {error:.2g})."
         raise CaptureError(text)
     return pose
 
