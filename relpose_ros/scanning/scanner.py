@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+import logging
+import threading
 import time
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, get_args
+
+from relpose_ros.scanning.incoming import (
+    Arrival,
+    Kind,
+    Pairing,
+    ViewError,
+    object_id_of,
+    source_of,
+    stamp_text,
+    view_from_image,
+    view_from_object_view,
+)
+from relpose_ros.scanning.scan_buffer import ScanBuffer
+from relpose_ros.views import Scan
 
 if TYPE_CHECKING:
-    from relpose_ros.estimates import ScanEstimate
-    from relpose_ros.scanning.settings import ScanSettings
-    from relpose_ros.views import Scan
+    from collections.abc import Callable, Mapping
 
-Kind = Literal["object_view", "image", "compressed", "camera_info"]
-"""ObjectView; sensor_msgs/Image; sensor_msgs/CompressedImage; sensor_msgs/CameraInfo."""
+    from relpose_ros.estimates import ScanEstimate
+    from relpose_ros.scanning.incoming import ImagePair, Source
+    from relpose_ros.scanning.settings import ScanSettings
+    from relpose_ros.views import View
+
+_logger = logging.getLogger("relpose_ros")
 
 
 class SupportsEstimate(Protocol):
@@ -95,7 +112,8 @@ class Scanner:
     """Collects the views of each object and estimates every scan that changed.
 
     ``receive`` may be called from several threads while another one runs ``estimate_pending``. Events worth
-    a line in the log go to the standard logger ``relpose_ros``; reasons of single messages are in their receipts.
+    a line in the log go to the standard logger ``relpose_ros``; what was wrong with a message is in its
+    receipt.
     """
 
     def __init__(
@@ -108,6 +126,19 @@ class Scanner:
             settings: Which views to hold, and how long.
             clock: Seconds, for latencies alone.
         """
+        self._estimator = estimator
+        self._settings = settings
+        self._clock = clock
+        # Order of acquisition: _estimating or _receiving, then _state. Views enter a scan in the order of
+        # their messages although decoding takes a while, and the state stays free meanwhile.
+        self._estimating = threading.Lock()
+        self._receiving = threading.RLock()
+        self._state = threading.Lock()
+        self._pairing = Pairing(settings.pairing_queue, round(settings.backward_jump_s * 1e9))
+        self._scans: dict[str, _ScanState] = {}
+        self._topics: dict[str, _TopicState] = {}
+        self._failed = 0
+        self._last_failure = ""
 
     def receive(self, kind: Kind, topic: str, message: Any, camera: str = "") -> Receipt:
         """Take one message in. Never raises for a bad message: the receipt says what was wrong.
@@ -119,11 +150,28 @@ class Scanner:
             camera: Whose image or camera info it is, where there are several cameras: only messages
                 of one camera are paired.
         """
-        raise NotImplementedError
+        if kind not in get_args(Kind):
+            raise ValueError(f"There is no message kind {kind!r}.")
+        with self._receiving:
+            with self._state:
+                self._topics.setdefault(topic, _TopicState()).received += 1
+            try:
+                if kind == "object_view":
+                    return self._receive_object_view(topic, message)
+                return self._receive_half(kind, topic, message, camera)
+            except ViewError as err:
+                return self._rejected(topic, "", str(err))
+            except Exception as err:
+                # The message types rule this out, an object with the same fields does not; and a callback
+                # that raises would end the node.
+                _logger.debug("A message on %s could not be read.", topic, exc_info=True)
+                text = f"{topic}: the message cannot be read as {kind}: {type(err).__name__}: {err}."
+                return self._rejected(topic, "", text)
 
     def pending(self) -> bool:
         """Whether ``estimate_pending`` has work to do."""
-        raise NotImplementedError
+        with self._state:
+            return any(state.buffer.has_work() for state in self._scans.values())
 
     def estimate_pending(self) -> list[Result]:
         """Estimate each scan that changed since its last estimate and has two views or more.
@@ -132,11 +180,19 @@ class Scanner:
         ``pending()``. A result whose scan was reset while it was made is dropped; so is a trial of a
         further view (keep policy "spread") that the scan does not take.
         """
-        raise NotImplementedError
+        with self._estimating:
+            with self._state:
+                changed = [state for state in self._scans.values() if state.buffer.has_work()]
+            return self._estimate(changed)
 
     def estimate_now(self, object_id: str | None = None) -> list[Result]:
         """Estimate a scan, or all, changed or not. Empty where none has two views."""
-        raise NotImplementedError
+        with self._estimating:
+            with self._state:
+                chosen = [self._scans[each] for each in self._scans if object_id in {None, each}]
+                for state in chosen:
+                    state.buffer.require_work()
+            return self._estimate(chosen)
 
     def reset(self, reason: str, object_id: str | None = None) -> int:
         """Forget the views of one object, or of all, and what waits for its counterpart.
@@ -148,15 +204,169 @@ class Scanner:
         Returns:
             How many views were forgotten.
         """
-        raise NotImplementedError
+        with self._receiving, self._state:
+            self._pairing.clear()
+            chosen = [each for each in self._scans if object_id in {None, each}]
+            forgotten = 0
+            for each in chosen:
+                views = len(self._scans.pop(each).buffer.views)
+                forgotten += views
+                _logger.info("The scan of %r with %d views is forgotten: %s.", each, views, reason)
+            return forgotten
 
     def drop_last_view(self, object_id: str | None = None) -> Receipt:
         """Forget the newest view of an object, or of the object that was seen last.
 
         ``accepted`` tells whether there was one, ``reason`` what was dropped.
         """
-        raise NotImplementedError
+        with self._receiving, self._state:
+            # The object seen last stands last.
+            chosen = [each for each in reversed(self._scans) if object_id in {None, each}]
+            for each in chosen:
+                view = self._scans[each].buffer.drop_last()
+                if view is not None:
+                    text = f"The view of {each!r} with stamp {stamp_text(view.stamp_ns)} is dropped."
+                    return Receipt(True, each, text)
+        of = "" if object_id is None else f" of {object_id!r}"
+        return Receipt(False, object_id or "", f"There is no view{of} to drop.")
 
     def statistics(self) -> Statistics:
         """A snapshot for diagnostics."""
-        raise NotImplementedError
+        with self._receiving:
+            waiting = self._pairing.waiting()
+        with self._state:
+            return Statistics(
+                topics={
+                    topic: TopicStatistics(each.received, each.used, each.rejected, each.last_reason)
+                    for topic, each in self._topics.items()
+                },
+                scans={object_id: state.snapshot() for object_id, state in self._scans.items()},
+                waiting=sum(waiting.values()),
+                failed=self._failed,
+                last_failure=self._last_failure,
+            )
+
+    def _receive_object_view(self, topic: str, message: Any) -> Receipt:
+        source = source_of(message, topic)
+        object_id = object_id_of(message, source, self._settings.object_id)
+        return self._offer(object_id, source, lambda: view_from_object_view(message, source), (topic,))
+
+    def _receive_half(self, kind: Kind, topic: str, message: Any, camera: str) -> Receipt:
+        source = source_of(message, topic)
+        receipts = [
+            self._offer_pair(pair) for pair in self._pairing.add(kind, Arrival(message, source), camera)
+        ]
+        if not receipts:
+            return Receipt(False, "", "")
+        # Of a picture that came both raw and compressed, one is enough.
+        return max(receipts, key=lambda receipt: (receipt.accepted, receipt.rejected))
+
+    def _offer_pair(self, pair: ImagePair) -> Receipt:
+        image, info = pair.image, pair.info
+        topics = (image.source.topic, info.source.topic)
+        try:
+            return self._offer(
+                self._settings.object_id,
+                image.source,
+                lambda: view_from_image(image.message, info.message, image.source),
+                topics,
+            )
+        except ViewError as err:
+            return self._rejected(image.source.topic, self._settings.object_id, str(err))
+
+    def _offer(
+        self, object_id: str, source: Source, decode: Callable[[], View], topics: tuple[str, ...]
+    ) -> Receipt:
+        """Give a view to its scan; it is decoded only if the scan may want it."""
+        with self._state:
+            known = self._scans.get(object_id)
+            decision = None if known is None else known.buffer.declines(source.stamp_ns, source.topic)
+        if decision is None:
+            view = decode()
+            with self._state:
+                state = self._scans.get(object_id) or self._begin_scan(object_id)
+                decision = state.buffer.add(view, source.topic)
+                if decision.accepted:
+                    state.arrived = self._clock()
+                    self._scans[object_id] = self._scans.pop(object_id)
+                    for topic in topics:
+                        self._topics[topic].used += 1
+                    return Receipt(True, object_id, "")
+        text = str(source.rejection(decision.reason))
+        if decision.rejected:
+            return self._rejected(source.topic, object_id, text)
+        return Receipt(False, object_id, text)
+
+    def _begin_scan(self, object_id: str) -> _ScanState:
+        if len(self._scans) >= self._settings.max_scans:
+            oldest = next(iter(self._scans))
+            views = len(self._scans.pop(oldest).buffer.views)
+            text = "The scan of %r with %d views makes room for %r: max_scans is %d."
+            _logger.info(text, oldest, views, object_id, self._settings.max_scans)
+        self._scans[object_id] = _ScanState(ScanBuffer(object_id, self._settings))
+        return self._scans[object_id]
+
+    def _rejected(self, topic: str, object_id: str, reason: str) -> Receipt:
+        with self._state:
+            self._topics[topic].rejected += 1
+            self._topics[topic].last_reason = reason
+        return Receipt(False, object_id, reason, rejected=True)
+
+    def _estimate(self, states: list[_ScanState]) -> list[Result]:
+        """One estimate of each scan; the state is free while the estimator runs."""
+        results = []
+        for state in states:
+            with self._state:
+                work, arrived = state.buffer.work(), state.arrived
+            if work is None:
+                continue
+            scan = Scan(state.buffer.object_id, work.views)
+            try:
+                estimate = self._estimator.estimate(scan)
+            except Exception as err:
+                text = f"The estimate of {scan.object_id!r} from {len(scan.views)} views failed: {err}"
+                _logger.error("%s; the views are kept.", text, exc_info=True)
+                with self._state:
+                    state.buffer.give_up(work)
+                    self._failed += 1
+                    self._last_failure = text
+                continue
+            with self._state:
+                current = self._scans.get(scan.object_id) is state
+                if current and state.buffer.settle(work, estimate):
+                    state.estimates += 1
+                    state.latency_s = self._clock() - arrived
+                    state.estimate = estimate
+                    results.append(Result(scan, estimate))
+        return results
+
+
+@dataclass
+class _TopicState:
+    received: int = 0
+    used: int = 0
+    rejected: int = 0
+    last_reason: str = ""
+
+
+@dataclass
+class _ScanState:
+    buffer: ScanBuffer
+    arrived: float = 0.0
+    """When the newest view came, by the scanner's clock."""
+    estimates: int = 0
+    latency_s: float | None = None
+    estimate: ScanEstimate | None = None
+
+    def snapshot(self) -> ScanStatistics:
+        pairs = () if self.estimate is None else self.estimate.pairs
+        weakest = pairs[self.estimate.weakest_pair] if self.estimate is not None and pairs else None
+        return ScanStatistics(
+            views=len(self.buffer.views),
+            estimates=self.estimates,
+            dropped=self.buffer.dropped,
+            latency_s=self.latency_s,
+            status="" if self.estimate is None else self.estimate.status,
+            weakest_pair=None if weakest is None else (weakest.i, weakest.j),
+            weakest_probability=None if weakest is None else weakest.probability_within_15_deg,
+        )

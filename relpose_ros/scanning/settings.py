@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 MAX_NAME_LENGTH = 128
-"""Longest object id or frame name, characters: a longer one is garbage, and it would go out with every message."""
+"""Longest object id or frame name, characters: a longer one is garbage, and would go out in every message."""
 
 
 class SettingsError(RelPoseError):
@@ -55,40 +55,43 @@ class ScanSettings:
 
     object_frame: str = _setting(
         "object",
-        "Name of the object frame in outgoing headers. Keep it apart from map and odom: its scale is usually unknown.",
+        "Name of the object frame in outgoing headers. Keep it apart from map and odom: its scale is mostly "
+        "unknown.",
     )
     object_id: str = _setting(
         "object",
-        "Object id of views that come as Image + CameraInfo, which carry none, or as ObjectView with an empty one.",
+        "Object id of views that come without one: all Image + CameraInfo, and ObjectView where it is empty.",
     )
     max_views: int = _setting(
         MAX_VIEWS,
-        "Most views held of one object. Time per estimate grows with the number of pairs; the network knows 8 views.",
+        "Most views held of one object. The network knows 8 at most; fewer make an estimate faster, since "
+        "its time grows with the number of pairs.",
         limits=(MIN_VIEWS, MAX_VIEWS),
     )
     keep: str = _setting(
         "spread",
-        "Which views stay when more than max_views arrive. first: the earliest, so that poses never change frame. "
-        "latest: the newest, for an object that moves now and then; the frame moves on with the oldest view. "
-        "spread: the first and those that look from directions furthest apart, for an orbit of many frames.",
+        "Which views stay when more than max_views arrive. first: the earliest, so that neither frame nor set "
+        "changes any more. latest: the newest, for an object that is moved now and then; the frame moves on "
+        "with the oldest view. spread: the first, which sets the frame, and those that look from directions "
+        "furthest apart, for an orbit of many frames.",
         choices=("first", "latest", "spread"),
     )
     max_scans: int = _setting(
         4,
-        "Most objects held at once; a further one takes the place of the object seen longest ago. Bounds memory where "
-        "a tracker numbers its objects without end.",
+        "Most objects held at once; a further one takes the place of the object seen longest ago. Bounds the "
+        "memory where a tracker numbers its objects without end.",
         limits=(1, 64),
     )
     pairing_queue: int = _setting(
         30,
-        "Most images, and most camera infos, that wait for the other one of the same stamp. Bounds memory: each "
-        "waiting image is held whole.",
+        "Most images, and most camera infos, that wait for the other one of the same stamp. Bounds the "
+        "memory: a waiting image is held whole.",
         limits=(1, 1000),
     )
     backward_jump_s: float = _setting(
         1.0,
-        "How far back, in seconds, a stamp must lie to count as time jumping backwards (a bag that loops) and not as "
-        "a late message. A second message must confirm the jump before the scan starts anew.",
+        "How far back, in seconds, a stamp must lie to count as time jumping backwards (a bag that loops) "
+        "and not as a late message. A second message must confirm the jump before the scan starts anew.",
         limits=(0.001, 86400.0),
     )
     image_transports: tuple[str, ...] = _setting(
@@ -97,10 +100,13 @@ class ScanSettings:
         choices=("raw", "compressed"),
         fixed=True,
     )
-    weights: str = _setting("", "Path of a weights file; empty: the compact weights that ship with the package.")
+    weights: str = _setting(
+        "", "Path of a weights file; empty: the compact weights that ship with the package."
+    )
     threads: int = _setting(
         0,
-        "Threads of the network on the CPU; 0: as many as PyTorch takes by itself. Fewer leave cores to others.",
+        "Threads of the network on the CPU; 0: as many as PyTorch takes by itself. Fewer leave cores to "
+        "others.",
         limits=(0, 256),
     )
     autostart: bool = _setting(
@@ -169,7 +175,9 @@ class ScanSettings:
             found = True
             values.update(parameters)
         if not found:
-            text = f"{path} holds no parameters of the scan node: start it with '/**:' and 'ros__parameters:'."
+            text = (
+                f"{path} holds no parameters of the scan node: start it with '/**:' and 'ros__parameters:'."
+            )
             raise SettingsError(text)
         own = {name: value for name, value in values.items() if name not in {"use_sim_time", "qos_overrides"}}
         return cls.from_mapping(own)

@@ -1,0 +1,369 @@
+"""Messages to views: what a message claims is checked here, and nothing wrong gets past.
+
+Every refusal is a sentence that names the topic, the stamp and the value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from relpose_ros.errors import RelPoseError
+from relpose_ros.scanning import image_decoding
+from relpose_ros.scanning.image_decoding import ImageError, Region
+from relpose_ros.scanning.settings import MAX_NAME_LENGTH
+from relpose_ros.views import BoundingBox, Intrinsics, View
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy.typing as npt
+
+Kind = Literal["object_view", "image", "compressed", "camera_info"]
+"""relpose_ros/ObjectView; sensor_msgs/Image, CompressedImage and CameraInfo."""
+
+MIN_BOX_SIDE = 8
+"""Pixels: a smaller box shows nothing of an object that a network could use."""
+
+MAX_FULL_SIDE = 2**16
+"""Pixels: a larger full image is garbage."""
+
+_REGION_SCALE = 1.2
+"""Part of the picture kept around a box, in units of its longer side: the network's crop is 1.15, and a
+margin keeps the crop's interpolation off the region's edge."""
+
+
+class ViewError(RelPoseError):
+    """A message that is no view; the text names the topic, the stamp and the value."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a message came from, and when and where its picture was taken."""
+
+    topic: str
+    stamp_ns: int
+    frame_id: str
+
+    def rejection(self, what: str) -> ViewError:
+        """The error that says what was wrong with the message."""
+        return ViewError(f"{self.topic}, stamp {stamp_text(self.stamp_ns)}: {what}.")
+
+
+@dataclass(frozen=True)
+class _Picture:
+    width: int
+    height: int
+    decode: Callable[[Region], npt.NDArray[np.uint8]]
+
+
+def stamp_text(stamp_ns: int) -> str:
+    """A stamp for a person, in seconds with all nine digits."""
+    return f"{stamp_ns // 1_000_000_000}.{stamp_ns % 1_000_000_000:09d}"
+
+
+def source_of(message: Any, topic: str) -> Source:
+    """What the header of a message says.
+
+    Raises:
+        ViewError: The stamp is no time, or the frame no name.
+    """
+    seconds, nanoseconds = int(message.header.stamp.sec), int(message.header.stamp.nanosec)
+    if seconds < 0 or not 0 <= nanoseconds < 1_000_000_000:
+        text = f"{topic}: the stamp is no time: sec is {seconds}, nanosec is {nanoseconds}."
+        raise ViewError(text)
+    source = Source(topic, seconds * 1_000_000_000 + nanoseconds, message.header.frame_id)
+    _check_name(source.frame_id, "frame_id", source)
+    return source
+
+
+def object_id_of(message: Any, source: Source, default: str) -> str:
+    """The object id of an ObjectView, or the default where it is empty.
+
+    Raises:
+        ViewError: It is too long or holds what cannot be printed.
+    """
+    _check_name(message.object_id, "object_id", source)
+    return message.object_id or default
+
+
+def view_from_object_view(message: Any, source: Source) -> View:
+    """The view in a relpose_ros/ObjectView.
+
+    Raises:
+        ViewError: A field is wrong, or two of them contradict each other.
+    """
+    raw, compressed = message.image, message.compressed
+    if len(raw.data) and len(compressed.data):
+        raise source.rejection("both image and compressed are filled: leave one of them empty")
+    try:
+        picture = _compressed_picture(compressed) if len(compressed.data) else _raw_picture(raw)
+        box = _box(message.box, "box", source)
+        full_width, full_height = int(message.full_width), int(message.full_height)
+        if not (0 < full_width <= MAX_FULL_SIDE and 0 < full_height <= MAX_FULL_SIDE):
+            raise source.rejection(f"the full image is said to have {full_width} x {full_height} pixels")
+        origin = _origin_of_crop(message.crop, picture, box, (full_width, full_height), source)
+        mask = message.mask
+        if len(mask.data) and (int(mask.width), int(mask.height)) != (picture.width, picture.height):
+            sizes = f"{mask.width} x {mask.height} pixels, the picture {picture.width} x {picture.height}"
+            raise source.rejection(f"the mask has {sizes}")
+        decode_mask = partial(image_decoding.decode_mask, mask) if len(mask.data) else None
+        intrinsics = _intrinsics(message.k, source)
+        return _view(picture, origin, box, (full_width, full_height), intrinsics, decode_mask, source)
+    except ImageError as err:
+        raise source.rejection(str(err)) from err
+
+
+def view_from_image(image: Any, info: Any, source: Source) -> View:
+    """The view in a sensor_msgs/Image or CompressedImage and the CameraInfo of the same stamp.
+
+    The box is the camera info's roi; an roi of zeros is the full image. As in image_pipeline, the picture
+    shows the full image or the roi alone: its size tells which.
+
+    Args:
+        image: The picture.
+        info: Its camera info.
+        source: Where and when ``image`` was taken.
+
+    Raises:
+        ViewError: A field is wrong, or two of them contradict each other.
+    """
+    if max(int(info.binning_x), int(info.binning_y)) > 1:
+        text = (
+            f"binning is {info.binning_x} x {info.binning_y} in camera_info: publish the size and the matrix "
+        )
+        raise source.rejection(text + "of the picture itself and a binning of 0")
+    try:
+        picture = _raw_picture(image) if hasattr(image, "encoding") else _compressed_picture(image)
+    except ImageError as err:
+        raise source.rejection(str(err)) from err
+    size, full = (picture.width, picture.height), (int(info.width), int(info.height))
+    whole = not any(_roi(info.roi))
+    if full == (0, 0) and whole:
+        full = size  # an uncalibrated camera's info
+    box = BoundingBox(0.0, 0.0, *map(float, full)) if whole else _box(info.roi, "roi", source)
+    if size == full:
+        origin = (0, 0)
+    elif not whole and size == (box.width, box.height):
+        origin = (int(box.x0), int(box.y0))
+    else:
+        text = (
+            f"the picture has {size[0]} x {size[1]} pixels: neither the {full[0]} x {full[1]} of camera_info"
+        )
+        raise source.rejection(f"{text} nor the {box.width:.0f} x {box.height:.0f} of its roi")
+    if max(full) > MAX_FULL_SIDE:
+        raise source.rejection(f"the full image is said to have {full[0]} x {full[1]} pixels")
+    intrinsics = _intrinsics(info.k, source)
+    try:
+        return _view(picture, origin, box, full, intrinsics, None, source)
+    except ImageError as err:
+        raise source.rejection(str(err)) from err
+
+
+def _view(
+    picture: _Picture,
+    origin: tuple[int, int],
+    box: BoundingBox,
+    full: tuple[int, int],
+    intrinsics: Intrinsics | None,
+    decode_mask: Callable[[Region], npt.NDArray[np.bool_]] | None,
+    source: Source,
+) -> View:
+    """The view, with only that part of the picture that the network's crop needs."""
+    shown = (origin[0], origin[1], origin[0] + picture.width, origin[1] + picture.height)
+    if box.x1 > full[0] or box.y1 > full[1]:
+        raise source.rejection(
+            f"{_box_text(box)} lies outside the full image of {full[0]} x {full[1]} pixels"
+        )
+    if box.x0 < shown[0] or box.y0 < shown[1] or box.x1 > shown[2] or box.y1 > shown[3]:
+        raise source.rejection(f"{_box_text(box)} lies outside the picture, which shows {list(shown)}")
+    centre_x, centre_y = (box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2
+    half = _REGION_SCALE * max(box.width, box.height) / 2
+    x0, y0 = max(math.floor(centre_x - half), shown[0]), max(math.floor(centre_y - half), shown[1])
+    x1, y1 = min(math.ceil(centre_x + half), shown[2]), min(math.ceil(centre_y + half), shown[3])
+    region = Region(x0 - origin[0], y0 - origin[1], x1 - origin[0], y1 - origin[1])
+    return View(
+        image=picture.decode(region),
+        box=box,
+        full_width=full[0],
+        full_height=full[1],
+        origin=(x0, y0),
+        stamp_ns=source.stamp_ns,
+        frame_id=source.frame_id,
+        intrinsics=intrinsics,
+        mask=None if decode_mask is None else decode_mask(region),
+    )
+
+
+def _raw_picture(message: Any) -> _Picture:
+    return _Picture(*image_decoding.raw_size(message), partial(image_decoding.decode_image, message))
+
+
+def _compressed_picture(message: Any) -> _Picture:
+    size = image_decoding.compressed_size(message)
+    return _Picture(*size, partial(image_decoding.decode_compressed, message))
+
+
+def _origin_of_crop(
+    crop: Any, picture: _Picture, box: BoundingBox, full: tuple[int, int], source: Source
+) -> tuple[int, int]:
+    """Where the picture of an ObjectView begins in the full image."""
+    x, y, width, height = _roi(crop)
+    size = (picture.width, picture.height)
+    if any((x, y, width, height)):
+        if size != (width, height):
+            text = f"crop has {width} x {height} pixels, the picture {size[0]} x {size[1]}"
+            raise source.rejection(text)
+        if x + width > full[0] or y + height > full[1]:
+            extent = [x, y, x + width, y + height]
+            text = f"crop {extent} lies outside the full image of {full[0]} x {full[1]} pixels"
+            raise source.rejection(text)
+        return x, y
+    if size == full:
+        return 0, 0
+    if size == (box.width, box.height):
+        return int(box.x0), int(box.y0)
+    text = (
+        f"the picture has {size[0]} x {size[1]} pixels: neither the full image's {full[0]} x {full[1]} nor "
+    )
+    raise source.rejection(
+        f"{text}the box's {box.width:.0f} x {box.height:.0f}; fill crop to say what it shows"
+    )
+
+
+def _box(roi: Any, name: str, source: Source) -> BoundingBox:
+    x, y, width, height = _roi(roi)
+    if width < MIN_BOX_SIDE or height < MIN_BOX_SIDE:
+        text = (
+            f"{name} has {width} x {height} pixels: an object needs {MIN_BOX_SIDE} x {MIN_BOX_SIDE} at least"
+        )
+        raise source.rejection(text)
+    return BoundingBox(float(x), float(y), float(x + width), float(y + height))
+
+
+def _roi(roi: Any) -> tuple[int, int, int, int]:
+    return int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)
+
+
+def _box_text(box: BoundingBox) -> str:
+    return f"the box [{box.x0:.0f}, {box.y0:.0f}, {box.x1:.0f}, {box.y1:.0f}]"
+
+
+def _intrinsics(k: Any, source: Source) -> Intrinsics | None:
+    """From a row-major matrix K; None where it is all zero."""
+    matrix = np.asarray(k, np.float64)
+    if not np.isfinite(matrix).all():
+        raise source.rejection(f"the intrinsic matrix holds what is no number: {matrix.tolist()}")
+    if not matrix.any():
+        return None
+    fx, fy, cx, cy = (float(matrix[index]) for index in (0, 4, 2, 5))
+    if fx <= 0 or fy <= 0:
+        raise source.rejection(f"the focal length in the intrinsic matrix is {fx}, {fy}: it must be positive")
+    # ROS puts (0, 0) at the first pixel's centre, we at its outer corner.
+    return Intrinsics(fx, fy, cx + 0.5, cy + 0.5)
+
+
+def _check_name(name: str, what: str, source: Source) -> None:
+    if len(name) > MAX_NAME_LENGTH:
+        text = f"{what} has {len(name)} characters, more than {MAX_NAME_LENGTH}: {name[:40]!r}..."
+        raise source.rejection(text)
+    if not name.isprintable():
+        raise source.rejection(f"{what} {name!r} holds what cannot be printed")
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """A message on its way to become half of a view."""
+
+    message: Any
+    source: Source
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePair:
+    """A picture and the camera info of the same stamp."""
+
+    image: Arrival
+    info: Arrival
+
+
+class Pairing:
+    """Brings images and camera infos of one stamp together, whichever comes first.
+
+    A camera info stays after it was used: the same picture may come raw and compressed. What waits longest
+    goes when there is too much of it, and so does what lies ahead of a clock that jumped backwards.
+    """
+
+    def __init__(self, limit: int, backward_jump_ns: int) -> None:
+        """Make an empty one.
+
+        Args:
+            limit: Most messages that wait, of each kind and camera.
+            backward_jump_ns: How far back a stamp must lie to count as a jump, and not as late.
+        """
+        self._limit = limit
+        self._backward_jump_ns = backward_jump_ns
+        self._queues: dict[tuple[str, Kind], _Queue] = {}
+
+    def add(self, kind: Kind, arrival: Arrival, camera: str) -> list[ImagePair]:
+        """Take a message in; give back each pair that it completes."""
+        stamp_ns = arrival.source.stamp_ns
+        self._queue(camera, kind).follow_clock(stamp_ns)
+        if kind == "camera_info":
+            self._queue(camera, kind).put(arrival)
+            images = [self._queue(camera, each).messages.pop(stamp_ns, None) for each in _IMAGE_KINDS]
+            return [ImagePair(image, arrival) for image in images if image is not None]
+        info = self._queue(camera, "camera_info").messages.get(stamp_ns)
+        if info is not None:
+            return [ImagePair(arrival, info)]
+        self._queue(camera, kind).put(arrival)
+        return []
+
+    def clear(self) -> None:
+        """Forget everything that waits."""
+        self._queues.clear()
+
+    def waiting(self) -> dict[str, int]:
+        """How many images wait for their camera info, by topic."""
+        images = [queue for (_, kind), queue in self._queues.items() if kind in _IMAGE_KINDS]
+        topics = [arrival.source.topic for queue in images for arrival in queue.messages.values()]
+        return {topic: topics.count(topic) for topic in topics}
+
+    def _queue(self, camera: str, kind: Kind) -> _Queue:
+        return self._queues.setdefault((camera, kind), _Queue(self._limit, self._backward_jump_ns))
+
+
+_IMAGE_KINDS: tuple[Kind, ...] = ("image", "compressed")
+
+
+class _Queue:
+    """Messages of one kind and camera by stamp, in the order of their arrival."""
+
+    def __init__(self, limit: int, backward_jump_ns: int) -> None:
+        self.messages: OrderedDict[int, Arrival] = OrderedDict()
+        self._limit = limit
+        self._backward_jump_ns = backward_jump_ns
+        self._newest_ns = 0
+        self._suspect_ns: int | None = None
+
+    def put(self, arrival: Arrival) -> None:
+        self.messages[arrival.source.stamp_ns] = arrival
+        if len(self.messages) > self._limit:
+            self.messages.popitem(last=False)
+
+    def follow_clock(self, stamp_ns: int) -> None:
+        """Forget what lies in the future once two messages in order agree that time jumped back."""
+        if stamp_ns >= self._newest_ns - self._backward_jump_ns:
+            self._newest_ns = max(self._newest_ns, stamp_ns)
+            self._suspect_ns = None
+        elif self._suspect_ns is None or stamp_ns <= self._suspect_ns:
+            self._suspect_ns = stamp_ns
+        else:
+            self._newest_ns, self._suspect_ns = stamp_ns, None
+            for ahead in [each for each in self.messages if each > stamp_ns]:
+                del self.messages[ahead]

@@ -1,0 +1,285 @@
+"""The views held of one object: which are taken, which stay, and what is to be estimated next."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from relpose_ros.scanning.incoming import stamp_text
+from relpose_ros.views import MIN_VIEWS
+
+if TYPE_CHECKING:
+    from relpose_ros.estimates import FloatArray, ScanEstimate
+    from relpose_ros.scanning.settings import ScanSettings
+    from relpose_ros.views import View
+
+SPREAD_MARGIN = np.radians(1.0)
+"""How much further from all others than the most redundant view a newcomer must look, so that the noise of
+two estimates does not swap views of a camera that stands still."""
+
+_logger = logging.getLogger("relpose_ros")
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What became of a view."""
+
+    accepted: bool
+    reason: str = ""
+    """Why not, as the end of a sentence; empty where it was accepted."""
+    rejected: bool = False
+    """Whether something was wrong with it; neither accepted nor rejected is a view nobody needs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """Views to estimate, oldest first."""
+
+    views: tuple[View, ...]
+    newcomer: View | None
+    """The view whose place in the scan depends on the estimate (keep policy "spread"), or None."""
+    epoch: int
+    """The buffer's count of forgetting, when the work was given out."""
+
+
+class ScanBuffer:
+    """The views of one object.
+
+    A view that was taken leaves only by the keep policy, by a confirmed backward jump of time, or because
+    someone asked for it: nothing that arrives can damage what is held. Not thread-safe by itself.
+    """
+
+    def __init__(self, object_id: str, settings: ScanSettings) -> None:
+        """Make one without views."""
+        self.object_id = object_id
+        self.dropped = 0
+        """Views let go or declined by the keep policy, or forgotten after a jump of time."""
+        self._settings = settings
+        self._backward_jump_ns = round(settings.backward_jump_s * 1e9)
+        self._views: list[View] = []
+        self._candidates: deque[View] = deque()
+        self._on_trial: View | None = None
+        self._newest_on: dict[str, int] = {}
+        self._suspects: dict[str, View] = {}
+        self._declined_ns: int | None = None
+        self._changed = False
+        self._failed = False
+        self._base: ScanEstimate | None = None
+        """Of exactly the views held, where there is one."""
+        self._epoch = 0
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The views held, oldest first, without those whose place is not decided yet."""
+        return tuple(self._views)
+
+    def declines(self, stamp_ns: int, topic: str) -> Decision | None:
+        """The answer to a view that would not be taken whatever it shows; None: show it.
+
+        Saves decoding it.
+        """
+        newest_ns = self._newest_ns()
+        if self._jumps_back(stamp_ns, topic) or newest_ns is None:
+            return None
+        if stamp_ns == self._declined_ns or any(view.stamp_ns == stamp_ns for view in self._all()):
+            return Decision(False, "a view with this stamp was seen already")
+        if stamp_ns <= newest_ns:
+            late = f"it is {(newest_ns - stamp_ns) / 1e9:.3f} s older than the scan of {self.object_id!r}"
+            return Decision(
+                False, f"{late}, whose newest view has stamp {stamp_text(newest_ns)}", rejected=True
+            )
+        if self._settings.keep == "first" and len(self._views) >= self._settings.max_views:
+            return self._decline_further(stamp_ns, topic)
+        return None
+
+    def add(self, view: View, topic: str) -> Decision:
+        """Take a view, or say why not.
+
+        A stamp far behind the last one on its topic is a garbage stamp or a clock that jumped backwards. The
+        next message on the topic tells which: if it is behind as well and in order, time did jump.
+        """
+        declined = self.declines(view.stamp_ns, topic)
+        if declined is not None:
+            return declined
+        if self._jumps_back(view.stamp_ns, topic):
+            suspect = self._suspects.get(topic)
+            if suspect is None or view.stamp_ns <= suspect.stamp_ns:
+                self._suspects[topic] = view
+                behind = (self._newest_on[topic] - view.stamp_ns) / 1e9
+                text = (
+                    f"it is {behind:.3f} s older than the last one on this topic: rejected unless the next "
+                )
+                return Decision(False, text + "one confirms that time jumped backwards", rejected=True)
+            self._follow_jump(suspect)
+            self._take(suspect, topic)
+        return self._take(view, topic)
+
+    def work(self) -> Work | None:
+        """What to estimate next, which counts as begun; None where there is nothing to do."""
+        if self._changed and len(self._views) >= MIN_VIEWS:
+            self._changed = False
+            return Work(self.views, None, self._epoch)
+        if self._candidates and self._base is not None:
+            self._on_trial = self._candidates.popleft()
+            redundant = most_redundant(viewing_directions(self._base))
+            kept = [view for index, view in enumerate(self._views) if index != redundant]
+            return Work((*kept, self._on_trial), self._on_trial, self._epoch)
+        return None
+
+    def has_work(self) -> bool:
+        """Whether `work` has something to give."""
+        if self._changed and len(self._views) >= MIN_VIEWS:
+            return True
+        return bool(self._candidates) and self._base is not None
+
+    def require_work(self) -> None:
+        """Have the views estimated even if they did not change."""
+        self._changed = True
+
+    def settle(self, work: Work, estimate: ScanEstimate) -> bool:
+        """Take note of an estimate.
+
+        Returns:
+            Whether it is one of this scan: not of views that were forgotten meanwhile, nor with a newcomer
+            that the scan does not take.
+        """
+        if work.epoch != self._epoch:
+            return False
+        if work.newcomer is None:
+            self._base = estimate if work.views == self.views else None
+            return True
+        assert self._base is not None
+        self._on_trial = None
+        before = nearest_angles(viewing_directions(self._base)).min()
+        after = nearest_angles(viewing_directions(estimate))[-1]
+        if not after > before + SPREAD_MARGIN:
+            self._decline(work.newcomer)
+            return False
+        self._views, self._base = list(work.views), estimate
+        self.dropped += 1
+        return True
+
+    def give_up(self, work: Work) -> None:
+        """Take note that an estimate failed: the views stay, and the next view has it tried again."""
+        if work.epoch != self._epoch:
+            return
+        self._failed = True
+        if work.newcomer is not None:
+            self._on_trial = None
+            self._decline(work.newcomer)
+
+    def drop_last(self) -> View | None:
+        """Forget the newest view and give it back; None where there is none."""
+        views = self._all()
+        if not views:
+            return None
+        self._forget(views[-1:])
+        return views[-1]
+
+    def _take(self, view: View, topic: str) -> Decision:
+        """Take a view that is newer than all others."""
+        self._note_time(view.stamp_ns, topic)
+        # A newcomer on trial would wait for ever for the estimate that failed.
+        self._changed |= self._failed
+        self._failed = False
+        full = len(self._views) >= self._settings.max_views
+        if full and self._settings.keep == "first":
+            return self._decline_further(view.stamp_ns, topic)
+        if full and self._settings.keep == "spread":
+            self._candidates.append(view)
+            if len(self._candidates) > self._settings.max_views:
+                self._decline(self._candidates.popleft())
+            return Decision(True)
+        if full:
+            del self._views[0]
+            self.dropped += 1
+        self._views.append(view)
+        self._changed, self._base = True, None
+        return Decision(True)
+
+    def _decline_further(self, stamp_ns: int, topic: str) -> Decision:
+        self._note_time(stamp_ns, topic)
+        self.dropped += 1
+        return Decision(False, f"the scan of {self.object_id!r} has its {len(self._views)} views")
+
+    def _note_time(self, stamp_ns: int, topic: str) -> None:
+        """Time goes on in this topic: whatever lay far behind was garbage."""
+        self._newest_on[topic] = stamp_ns
+        self._suspects.pop(topic, None)
+
+    def _decline(self, candidate: View) -> None:
+        self._declined_ns = candidate.stamp_ns
+        self.dropped += 1
+
+    def _jumps_back(self, stamp_ns: int, topic: str) -> bool:
+        # Each topic's own clock: another one may lag behind by more than any jump.
+        newest_ns = self._newest_on.get(topic)
+        return newest_ns is not None and stamp_ns < newest_ns - self._backward_jump_ns
+
+    def _follow_jump(self, first: View) -> None:
+        """Forget what lies after the first view of the time that counts from now on."""
+        views = self._all()
+        ahead = [view for view in views if view.stamp_ns > first.stamp_ns]
+        repeated = any(view.stamp_ns == first.stamp_ns for view in views)
+        if len(ahead) == 1 and len(views) > 1 and not repeated:
+            text = "The view of %r with stamp %s is dropped: all others are older, so its stamp was wrong."
+            _logger.warning(text, self.object_id, stamp_text(ahead[0].stamp_ns))
+            self._forget(ahead)
+        elif ahead or repeated:
+            text = "Time jumped backwards from %s to %s: the scan of %r starts anew."
+            newest, stamp = stamp_text(views[-1].stamp_ns), stamp_text(first.stamp_ns)
+            _logger.warning(text, newest, stamp, self.object_id)
+            self._forget(views)
+        self._newest_on.clear()
+        self._suspects.clear()
+
+    def _forget(self, views: list[View]) -> None:
+        self.dropped += len(views)
+        self._epoch += 1
+        left = [view for view in self._all() if view not in views]
+        self._on_trial = None
+        self._views = left[: self._settings.max_views]
+        self._candidates = deque(left[self._settings.max_views :])
+        self._changed, self._base = True, None
+        if not left:
+            self._newest_on.clear()
+            self._suspects.clear()
+
+    def _all(self) -> list[View]:
+        """The views held and those whose place is not decided yet, oldest first."""
+        undecided = [] if self._on_trial is None else [self._on_trial]
+        return [*self._views, *undecided, *self._candidates]
+
+    def _newest_ns(self) -> int | None:
+        return max((view.stamp_ns for view in self._all()), default=None)
+
+
+def viewing_directions(estimate: ScanEstimate) -> FloatArray:
+    """The optical axes in the object frame, (N, 3)."""
+    return np.stack([camera.object_from_camera[:, 2] for camera in estimate.cameras])
+
+
+def nearest_angles(directions: FloatArray) -> FloatArray:
+    """The angle from each of two directions or more to the nearest other one, rad. (N, 3) -> (N,)."""
+    return np.asarray(_angles(directions).min(axis=1))
+
+
+def most_redundant(directions: FloatArray) -> int:
+    """Which view tells least that the others do not. (N, 3) -> index.
+
+    It is one of the two that look from the closest directions, namely the one with the closer second
+    neighbour; but never the first view, which sets the object frame.
+    """
+    closest = np.sort(_angles(directions), axis=1)[1:, :2]
+    return 1 + int(np.lexsort((closest[:, 1], closest[:, 0]))[0])
+
+
+def _angles(directions: FloatArray) -> FloatArray:
+    """Angles between all directions, (N, N); infinite between one and itself."""
+    angles: FloatArray = np.arccos(np.clip(directions @ directions.T, -1.0, 1.0))
+    np.fill_diagonal(angles, np.inf)
+    return angles
