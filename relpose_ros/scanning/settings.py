@@ -70,8 +70,8 @@ class ScanSettings:
     )
     keep: str = _setting(
         "spread",
-        "Which views stay when more than max_views arrive. first: the earliest, so that neither frame nor set "
-        "changes any more. latest: the newest, for an object that is moved now and then; the frame moves on "
+        "Which views stay when more than max_views arrive. first: the earliest, so that frame and set change "
+        "no more. latest: the newest, for an object that is moved now and then; the frame moves on "
         "with the oldest view. spread: the first, which sets the frame, and those that look from directions "
         "furthest apart, for an orbit of many frames.",
         choices=("first", "latest", "spread"),
@@ -155,7 +155,7 @@ class ScanSettings:
         """Settings from a ROS 2 parameter file (``/**: ros__parameters: ...``).
 
         With several nodes in the file, those named ``/**``, ``scan_node`` or ``/scan_node`` count, a later
-        one over an earlier one. ``use_sim_time`` and ``qos_overrides`` are the node's own and are passed over.
+        one over an earlier one. ``use_sim_time`` and ``qos_overrides`` are not the scanner's: passed over.
 
         Raises:
             SettingsError: The file cannot be read, is no parameter file, or holds a wrong value.
