@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
     from typing_extensions import Self
 
-    from relpose_ros.scanning.scanner import Kind
+    from relpose_ros.scanning.incoming import Kind
 
 logger = logging.getLogger("relpose_ros")
 
@@ -471,8 +471,8 @@ def _camera_info_of(bag: BagReader, image_topic: str, topics: dict[str, str]) ->
     if len(infos) == 1:
         return infos[0]
     text = (
-        f"{bag.path} has no camera info {beside} beside {image_topic}, so nothing says where the object's "
-        "box is; record it too (its roi is the box, an empty one the whole image), or use ObjectView messages."
+        f"{bag.path} has no camera info {beside} beside {image_topic}, so nothing says where the "
+        "object's box is; record it too (its roi is the box, an empty one the whole image), or ObjectView."
     )
     raise BagError(text)
 

@@ -1,0 +1,336 @@
+"""A bag through the node's own scanner, message by message in log order; the same files at every run."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import shutil
+from collections import Counter
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from relpose_ros.errors import RelPoseError
+from relpose_ros.geometry import so3
+from relpose_ros.replay.bags import POSE_STAMPED, BagReader, BagWriter, choose_inputs
+from relpose_ros.replay.comparison import TruePose
+from relpose_ros.replay.recording import Recording
+from relpose_ros.replay.report import write_report
+from relpose_ros.scanning.outgoing import estimate_message, markers, pose_array
+from relpose_ros.scanning.scanner import Scanner
+from relpose_ros.scanning.settings import ScanSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from relpose_ros.estimates import CameraPose, Mode, PairRotation
+    from relpose_ros.replay.recording import EstimateRecord, ViewRecord
+    from relpose_ros.scanning.scanner import SupportsEstimate
+
+logger = logging.getLogger("relpose_ros")
+
+ESTIMATE_TOPIC = "/scan_node/estimate"
+POSES_TOPIC = "/scan_node/poses"
+MARKERS_TOPIC = "/scan_node/markers"
+"""The node's own names, so that a layout made for the node shows a replay too."""
+GROUND_TRUTH_TOPIC = "ground_truth/pose"
+
+ESTIMATES_FOLDER, SCAN_FILE, REPORT_FILE = "estimates", "scan.json", "report.html"
+SHOWN_REASONS = 6
+"""Kinds of rejected messages that are told apart at the end."""
+
+
+class ReplayError(RelPoseError):
+    """A bag gave no estimate, or its output cannot be written where it was asked for."""
+
+
+def replay(
+    bag: Path,
+    output: Path,
+    *,
+    topics: Sequence[str] = (),
+    settings: ScanSettings | None = None,
+    weights: Path | None = None,
+    estimator: SupportsEstimate | None = None,
+) -> None:
+    """Estimate from a recorded bag what the node would have estimated, and write it down.
+
+    Writes ``output/estimates`` (a bag of ScanEstimate, PoseArray and MarkerArray, logged when their newest
+    view was), ``output/scan.json`` and ``output/report.html``; with several objects in the bag each has
+    a folder of its own in ``output``. The bag and the JSON are the same to the byte at every run.
+
+    Args:
+        bag: A rosbag2 folder, or a single .mcap or .db3 file.
+        output: Created; an earlier replay's output there is replaced, anything else is left alone.
+        topics: Topics of images or views; none: what the bag has, see ``choose_inputs``.
+        settings: Of the scanner; None for the defaults.
+        weights: A weights file; None for the settings' own, which are the shipped ones by default.
+        estimator: Makes the estimates; None for the learned one with ``weights``.
+
+    Raises:
+        BagError: The bag cannot be read or has no images.
+        ReplayError: No estimate came of it, or the output is in the way.
+        NetworkFileError: The weights cannot be loaded.
+    """
+    bag, output = Path(bag), Path(output)
+    settings = settings or ScanSettings()
+    _check_replaceable(output)
+    with BagReader(bag) as reader:
+        inputs = choose_inputs(reader, topics)
+        truth = _ground_truth(reader)
+        if estimator is None:
+            estimator = _learned_estimator(weights, settings)
+        scanner = Scanner(estimator, settings)
+        recordings: dict[str, Recording] = {}
+        rejections: Counter[str] = Counter()
+        examples: dict[str, str] = {}
+        total = sum(reader.counts[topic] for topic in inputs)
+        with logging_redirect_tqdm(), tqdm(total=total, desc=bag.name, unit=" msg", disable=None) as progress:
+            for record in reader.records(inputs):
+                entry = inputs[record.topic]
+                receipt = scanner.receive(entry.kind, record.topic, record.message, entry.camera)
+                if receipt.rejected:
+                    # The numbers differ from message to message, the reason does not.
+                    reason = re.sub(r"-?\d[\d.e+-]*", "#", receipt.reason)
+                    rejections[reason] += 1
+                    examples.setdefault(reason, receipt.reason)
+                while scanner.pending():
+                    for result in scanner.estimate_pending():
+                        object_id = result.scan.object_id
+                        recording = recordings.setdefault(object_id, Recording(object_id))
+                        recording.add(result, record.log_time_ns)
+                        progress.set_postfix_str(result.estimate.status[:60], refresh=False)
+                progress.update()
+    rejected = [(examples[reason], count) for reason, count in rejections.most_common()]
+    for topic, count in sorted(reader.unreadable.items()):
+        rejected.append((f"{topic}: the message is not what its type says.", count))
+    for example, count in rejected[:SHOWN_REASONS]:
+        logger.warning("%d rejected: %s", count, example)
+    if len(rejected) > SHOWN_REASONS:
+        more = sum(count for _, count in rejected[SHOWN_REASONS:])
+        logger.warning("%d more rejected for %d further reasons.", more, len(rejected) - SHOWN_REASONS)
+    if not recordings:
+        raise ReplayError(_why_nothing(bag, scanner, rejected))
+    with _written_whole(output) as folder:
+        for name, recording in _folders(recordings).items():
+            _write(folder / name, recording, settings, truth, rejected, bag.name)
+    for name, recording in _folders(recordings).items():
+        last = recording.estimates[-1].estimate
+        logger.info(
+            "%s: %d estimates of %r from %d views, %.2f s each; %s.",
+            *(output / name / REPORT_FILE, len(recording.estimates), recording.object_id),
+            *(len(recording.views), np.mean([each.estimate.seconds for each in recording.estimates])),
+            last.status,
+        )
+
+
+def _learned_estimator(weights: Path | None, settings: ScanSettings) -> SupportsEstimate:
+    from relpose_ros.inference.estimator import Estimator
+
+    if weights is None and settings.weights:
+        weights = Path(settings.weights)
+    return Estimator.from_weights(weights, settings.threads or None)
+
+
+def _ground_truth(reader: BagReader) -> dict[int, TruePose]:
+    """True camera poses by stamp, from every PoseStamped topic called ground_truth/pose."""
+    topics = [
+        topic
+        for topic, kind in reader.topics.items()
+        if kind == POSE_STAMPED and f"/{topic}".endswith(f"/{GROUND_TRUTH_TOPIC}")
+    ]
+    truth = {}
+    for record in reader.records(topics):
+        stamp, pose = record.message.header.stamp, record.message.pose
+        q, p = pose.orientation, pose.position
+        quaternion, centre = np.array([q.x, q.y, q.z, q.w]), np.array([p.x, p.y, p.z])
+        stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+        if not np.isfinite(centre).all() or not 0.99 < np.linalg.norm(quaternion) < 1.01:
+            logger.warning(
+                "The true pose on %s with stamp %d ns is no pose; it is left out.", record.topic, stamp_ns
+            )
+            continue
+        truth[stamp_ns] = TruePose(so3.from_quaternion_xyzw(quaternion), centre)
+    return truth
+
+
+def _why_nothing(bag: Path, scanner: Scanner, rejected: Sequence[tuple[str, int]]) -> str:
+    statistics = scanner.statistics()
+    held = sum(scan.views for scan in statistics.scans.values())
+    if statistics.failed:
+        return f"{bag} gave no estimate: {statistics.last_failure}."
+    reasons = f"; {rejected[0][1]} messages were rejected, such as: {rejected[0][0]}" if rejected else "."
+    if not held and not rejected and statistics.waiting:
+        return (
+            f"{bag} gave no estimate: no image and camera info with the same stamp, "
+            f"{statistics.waiting} of them wait for their counterpart."
+        )
+    count = {0: "no view", 1: "one view"}.get(held, f"{held} views")
+    return f"{bag} gave no estimate: {count} could be used, and an estimate takes two of one object{reasons}"
+
+
+def _folders(recordings: Mapping[str, Recording]) -> dict[str, Recording]:
+    """Where each object's output goes: nowhere deeper for a single one, else folders named after them."""
+    if len(recordings) == 1:
+        return {".": next(iter(recordings.values()))}
+    folders: dict[str, Recording] = {}
+    for object_id, recording in recordings.items():
+        safe = re.sub(r"[^\w.-]", "_", object_id, flags=re.ASCII).strip(".")[:80] or "object"
+        name, number = safe, 2
+        # Some file systems do not tell Mug from mug.
+        while name.lower() in {taken.lower() for taken in folders}:
+            name, number = f"{safe}-{number}", number + 1
+        folders[name] = recording
+    return folders
+
+
+def _write(
+    folder: Path,
+    recording: Recording,
+    settings: ScanSettings,
+    truth: Mapping[int, TruePose],
+    rejected: Sequence[tuple[str, int]],
+    title: str,
+) -> None:
+    folder.mkdir(exist_ok=True)
+    _write_bag(folder / ESTIMATES_FOLDER, recording, settings.object_frame)
+    (folder / SCAN_FILE).write_text(scan_json(recording), encoding="utf-8")
+    write_report(folder / REPORT_FILE, recording, truth, rejected, title)
+
+
+def _write_bag(path: Path, recording: Recording, object_frame: str) -> None:
+    with BagWriter(path) as bag:
+        bag.add_topic(ESTIMATE_TOPIC, "relpose_ros/msg/ScanEstimate", latched=True)
+        bag.add_topic(POSES_TOPIC, "geometry_msgs/msg/PoseArray", latched=True)
+        bag.add_topic(MARKERS_TOPIC, "visualization_msgs/msg/MarkerArray", latched=True)
+        for each in recording.estimates:
+            scan, estimate, log_time = each.scan, each.estimate, each.log_time_ns
+            message = estimate_message(estimate, scan, bag.types, object_frame, timed=False)
+            bag.write(ESTIMATE_TOPIC, log_time, message)
+            bag.write(POSES_TOPIC, log_time, pose_array(estimate, scan, bag.types, object_frame))
+            bag.write(MARKERS_TOPIC, log_time, markers(estimate, scan, bag.types, object_frame))
+
+
+def scan_json(recording: Recording) -> str:
+    """The recording as JSON.
+
+    ``views`` of an estimate are positions in the top-level ``views``; ``view``, ``i`` and ``j`` below it are
+    positions in the estimate's own ``views``, as in the messages. Matrices are flat and row-major, with the
+    units and frames of the messages; boxes are [left, top, right, bottom] in pixels of the full image, (0, 0)
+    being the outer corner of its first pixel.
+    """
+    views = [_view_json(index, view) for index, view in enumerate(recording.views)]
+    estimates = [_estimate_json(each) for each in recording.estimates]
+    # One view and one estimate a line: small, and a difference between two runs shows where it is.
+    return (
+        f'{{"object_id": {_json(recording.object_id)},\n"views": [\n{_lines(views)}\n],\n'
+        f'"estimates": [\n{_lines(estimates)}\n]}}\n'
+    )
+
+
+def _view_json(index: int, record: ViewRecord) -> dict[str, Any]:
+    view = record.view
+    return {
+        "index": index,
+        "stamp_ns": view.stamp_ns,
+        "frame_id": view.frame_id,
+        "box": [float(edge) for edge in (view.box.x0, view.box.y0, view.box.x1, view.box.y1)],
+    }
+
+
+def _estimate_json(record: EstimateRecord) -> dict[str, Any]:
+    estimate = record.estimate
+    return {
+        "views": list(record.views),
+        "scale_known": bool(estimate.scale_known),
+        "status": estimate.status,
+        "cameras": [_camera_json(camera) for camera in estimate.cameras],
+        "pairs": [_pair_json(pair) for pair in estimate.pairs],
+    }
+
+
+def _camera_json(camera: CameraPose) -> dict[str, Any]:
+    return {
+        "view": int(camera.view),
+        "position": _numbers(camera.position),
+        "orientation_xyzw": _numbers(so3.quaternion_xyzw(camera.object_from_camera)),
+        "covariance": _numbers(camera.covariance),
+    }
+
+
+def _pair_json(pair: PairRotation) -> dict[str, Any]:
+    return {
+        "i": int(pair.i),
+        "j": int(pair.j),
+        "orientation_xyzw": _numbers(so3.quaternion_xyzw(pair.camera_j_from_camera_i)),
+        "covariance": _numbers(pair.covariance),
+        "probability_within_15_deg": float(pair.probability_within_15_deg),
+        "entropy": float(pair.entropy),
+        "ambiguous": bool(pair.ambiguous),
+        "modes": [_mode_json(mode) for mode in pair.modes],
+    }
+
+
+def _mode_json(mode: Mode) -> dict[str, Any]:
+    return {
+        "orientation_xyzw": _numbers(so3.quaternion_xyzw(mode.camera_j_from_camera_i)),
+        "weight": float(mode.weight),
+        "covariance": _numbers(mode.covariance),
+    }
+
+
+def _numbers(array: np.typing.ArrayLike) -> list[float]:
+    return [float(value) for value in np.asarray(array, np.float64).reshape(-1)]
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, allow_nan=False, ensure_ascii=False)
+
+
+def _lines(values: Sequence[Any]) -> str:
+    return ",\n".join(_json(value) for value in values)
+
+
+def _check_replaceable(output: Path) -> None:
+    """Refuse an output that holds anything but an earlier replay's files."""
+    if not output.exists():
+        return
+    if not output.is_dir():
+        raise ReplayError(f"{output} is a file; name a folder for the output.")
+    foreign = _foreign(output)
+    if foreign is not None:
+        text = f"{output} holds {foreign}, which no replay wrote; name another folder or move it away."
+        raise ReplayError(text)
+
+
+def _foreign(folder: Path, depth: int = 0) -> str | None:
+    """The first entry of a folder that is none of a replay's."""
+    for entry in sorted(folder.iterdir()):
+        if entry.is_file() and entry.name in (SCAN_FILE, REPORT_FILE):
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            if entry.name == ESTIMATES_FOLDER and (folder / SCAN_FILE).is_file():
+                continue
+            if depth == 0 and (entry / SCAN_FILE).is_file() and _foreign(entry, depth + 1) is None:
+                continue
+        return entry.name
+    return None
+
+
+@contextmanager
+def _written_whole(output: Path) -> Iterator[Path]:
+    """A folder that takes the output's place when it is complete: a replay that fails leaves the old one."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=output.parent, prefix=f".{output.name}-") as temporary:
+        folder = Path(temporary) / "new"
+        folder.mkdir()
+        yield folder
+        if output.exists():
+            output.rename(Path(temporary) / "old")
+        shutil.move(folder, output)
