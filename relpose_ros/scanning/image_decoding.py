@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 MAX_PIXELS = 2**26
 """Largest picture, pixels (8192 x 8192). A larger one is a broken header or a decompression bomb."""
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_PNG_SIGNATURE, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 
 
 class ImageError(RelPoseError):
@@ -97,7 +98,9 @@ def decode_image(message: Any, region: Region | None = None) -> Pixels:
     try:
         pixels = layout.decode(raw, grown)
     except cv2.error as err:
-        raise ImageError(f"{width} x {height} {message.encoding} pixels cannot be converted: {err}") from err
+        raise ImageError(
+            f"{width} x {height} {message.encoding} pixels cannot be converted: {err.err}"
+        ) from err
     return np.ascontiguousarray(
         pixels[wanted.y0 - grown.y0 : wanted.y1 - grown.y0, wanted.x0 - grown.x0 : wanted.x1 - grown.x0]
     )
@@ -111,7 +114,10 @@ def decode_mask(message: Any, region: Region | None = None) -> npt.NDArray[np.bo
     """
     if message.encoding not in {"mono8", "8UC1"}:
         raise ImageError(f"the mask's encoding is {_shown(message.encoding)}: send mono8")
-    return np.asarray(decode_image(message, region)[..., 0] > 0)
+    try:
+        return np.asarray(decode_image(message, region)[..., 0] > 0)
+    except ImageError as err:
+        raise ImageError(f"the mask: {err}") from err
 
 
 def compressed_size(message: Any) -> tuple[int, int]:
@@ -120,7 +126,7 @@ def compressed_size(message: Any) -> tuple[int, int]:
     Raises:
         ImageError: It is no JPEG or PNG, its header is broken, or it has more pixels than anyone's camera.
     """
-    return _checked_size(*_encoded_size(_bytes(message.data).tobytes(), message.format))
+    return _compressed_header(_bytes(message.data).tobytes(), message.format)[:2]
 
 
 def decode_compressed(message: Any, region: Region | None = None) -> Pixels:
@@ -140,15 +146,16 @@ def decode_compressed(message: Any, region: Region | None = None) -> Pixels:
         ImageError: See `compressed_size`; or the data are cut off or do not decode.
     """
     data = _bytes(message.data)
+    encoded = data.tobytes()
     # The header is read first: decoding a few kilobytes can fill the memory.
-    width, height = compressed_size(message)
-    end = b"IEND" if data[:8].tobytes() == _PNG_SIGNATURE else b"\xff\xd9"
-    if end not in data[-1024:].tobytes():
+    width, height, frame = _compressed_header(encoded, message.format)
+    # OpenCV would fill in grey. Cameras may append what they like, and a thumbnail before has its own end.
+    if encoded.find(_PNG_END if encoded.startswith(_PNG_SIGNATURE) else _JPEG_END, frame) < 0:
         raise ImageError(f"the compressed data are cut off: {data.size} bytes without an end marker")
     try:
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as err:
-        raise ImageError(f"the {data.size} compressed bytes do not decode: {err}") from err
+        raise ImageError(f"the {data.size} compressed bytes do not decode: {err.err}") from err
     if bgr is None or bgr.shape != (height, width, 3):
         raise ImageError(f"the {data.size} compressed bytes do not decode to {width} x {height} pixels")
     wanted = Region(0, 0, width, height) if region is None else region
@@ -271,11 +278,12 @@ def _checked_size(width: int, height: int) -> tuple[int, int]:
     return width, height
 
 
-def _encoded_size(data: bytes, stated_format: Any) -> tuple[int, int]:
-    """Width and height in the header of a PNG (ISO/IEC 15948) or JPEG (ITU-T T.81, annex B)."""
+def _compressed_header(data: bytes, stated_format: Any) -> tuple[int, int, int]:
+    """Width, height and where they stand, of a PNG (ISO/IEC 15948) or a JPEG (ITU-T T.81, annex B)."""
     if data.startswith(_PNG_SIGNATURE) and data[12:16] == b"IHDR" and len(data) >= 24:
-        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-    if not data.startswith(b"\xff\xd8"):
+        width, height = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+        return *_checked_size(width, height), 16
+    if not data.startswith(_JPEG_START):
         text = f"the {len(data)} compressed bytes (format {_shown(stated_format)}) are neither JPEG nor PNG"
         raise ImageError(text)
     position = 2
@@ -284,8 +292,9 @@ def _encoded_size(data: bytes, stated_format: Any) -> tuple[int, int]:
         if marker == 0xFF:  # a fill byte
             position += 1
         elif 0xC0 <= marker <= 0xCF and marker not in {0xC4, 0xC8, 0xCC}:
-            height, width = data[position + 5 : position + 7], data[position + 7 : position + 9]
-            return int.from_bytes(width, "big"), int.from_bytes(height, "big")
+            height = int.from_bytes(data[position + 5 : position + 7], "big")
+            width = int.from_bytes(data[position + 7 : position + 9], "big")
+            return *_checked_size(width, height), position
         else:
             position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
     raise ImageError(f"the JPEG's header is broken: {len(data)} bytes without a frame size")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,7 +21,7 @@ from relpose_ros.scanning.settings import MAX_NAME_LENGTH
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     import numpy.typing as npt
 
@@ -61,6 +62,10 @@ class _Picture:
     height: int
     decode: Callable[[Region], npt.NDArray[np.uint8]]
 
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.width, self.height
+
 
 def stamp_text(stamp_ns: int) -> str:
     """A stamp for a person, in seconds with all nine digits."""
@@ -98,25 +103,21 @@ def view_from_object_view(message: Any, source: Source) -> View:
     Raises:
         ViewError: A field is wrong, or two of them contradict each other.
     """
-    raw, compressed = message.image, message.compressed
+    raw, compressed, mask = message.image, message.compressed, message.mask
     if len(raw.data) and len(compressed.data):
         raise source.rejection("both image and compressed are filled: leave one of them empty")
-    try:
+    full = int(message.full_width), int(message.full_height)
+    box = _box(message.box)
+    with _image_errors_rejected(source):
         picture = _compressed_picture(compressed) if len(compressed.data) else _raw_picture(raw)
-        box = _box(message.box, "box", source)
-        full_width, full_height = int(message.full_width), int(message.full_height)
-        if not (0 < full_width <= MAX_FULL_SIDE and 0 < full_height <= MAX_FULL_SIDE):
-            raise source.rejection(f"the full image is said to have {full_width} x {full_height} pixels")
-        origin = _origin_of_crop(message.crop, picture, box, (full_width, full_height), source)
-        mask = message.mask
-        if len(mask.data) and (int(mask.width), int(mask.height)) != (picture.width, picture.height):
-            sizes = f"{mask.width} x {mask.height} pixels, the picture {picture.width} x {picture.height}"
-            raise source.rejection(f"the mask has {sizes}")
-        decode_mask = partial(image_decoding.decode_mask, mask) if len(mask.data) else None
-        intrinsics = _intrinsics(message.k, source)
-        return _view(picture, origin, box, (full_width, full_height), intrinsics, decode_mask, source)
-    except ImageError as err:
-        raise source.rejection(str(err)) from err
+        origin = _origin_of_crop(message.crop, picture, box, full, source)
+        decode_mask = None
+        if len(mask.data):
+            decode_mask = partial(image_decoding.decode_mask, mask)
+            if image_decoding.raw_size(mask) != picture.size:
+                text = f"the mask has {_size_text(image_decoding.raw_size(mask))} pixels"
+                raise source.rejection(f"{text}, the picture {_size_text(picture.size)}")
+        return _view(picture, origin, box, full, _intrinsics(message.k, source), decode_mask, source)
 
 
 def view_from_image(image: Any, info: Any, source: Source) -> View:
@@ -134,35 +135,25 @@ def view_from_image(image: Any, info: Any, source: Source) -> View:
         ViewError: A field is wrong, or two of them contradict each other.
     """
     if max(int(info.binning_x), int(info.binning_y)) > 1:
-        text = (
-            f"binning is {info.binning_x} x {info.binning_y} in camera_info: publish the size and the matrix "
-        )
-        raise source.rejection(text + "of the picture itself and a binning of 0")
-    try:
+        text = f"binning is {info.binning_x} x {info.binning_y} in camera_info"
+        raise source.rejection(f"{text}: publish size and matrix as the picture has them, and a binning of 0")
+    with _image_errors_rejected(source):
         picture = _raw_picture(image) if hasattr(image, "encoding") else _compressed_picture(image)
-    except ImageError as err:
-        raise source.rejection(str(err)) from err
-    size, full = (picture.width, picture.height), (int(info.width), int(info.height))
-    whole = not any(_roi(info.roi))
-    if full == (0, 0) and whole:
-        full = size  # an uncalibrated camera's info
-    box = BoundingBox(0.0, 0.0, *map(float, full)) if whole else _box(info.roi, "roi", source)
-    if size == full:
-        origin = (0, 0)
-    elif not whole and size == (box.width, box.height):
-        origin = (int(box.x0), int(box.y0))
-    else:
-        text = (
-            f"the picture has {size[0]} x {size[1]} pixels: neither the {full[0]} x {full[1]} of camera_info"
-        )
-        raise source.rejection(f"{text} nor the {box.width:.0f} x {box.height:.0f} of its roi")
-    if max(full) > MAX_FULL_SIDE:
-        raise source.rejection(f"the full image is said to have {full[0]} x {full[1]} pixels")
-    intrinsics = _intrinsics(info.k, source)
-    try:
-        return _view(picture, origin, box, full, intrinsics, None, source)
-    except ImageError as err:
-        raise source.rejection(str(err)) from err
+        full = int(info.width), int(info.height)
+        if not any(_roi(info.roi)):
+            if full == (0, 0):  # nobody calibrated the camera
+                full = picture.size
+            box = BoundingBox(0.0, 0.0, float(full[0]), float(full[1]))
+        else:
+            box = _box(info.roi)
+        if picture.size == full:
+            origin = (0, 0)
+        elif picture.size == (box.width, box.height):
+            origin = (int(box.x0), int(box.y0))
+        else:
+            text = f"the picture has {_size_text(picture.size)} pixels: neither the {_size_text(full)} of "
+            raise source.rejection(f"{text}camera_info nor the {box.width:.0f} x {box.height:.0f} of its roi")
+        return _view(picture, origin, box, full, _intrinsics(info.k, source), None, source)
 
 
 def _view(
@@ -175,10 +166,17 @@ def _view(
     source: Source,
 ) -> View:
     """The view, with only that part of the picture that the network's crop needs."""
-    shown = (origin[0], origin[1], origin[0] + picture.width, origin[1] + picture.height)
+    if not all(0 < side <= MAX_FULL_SIDE for side in full):
+        raise source.rejection(f"the full image cannot have {_size_text(full)} pixels")
+    if min(box.width, box.height) < MIN_BOX_SIDE:
+        text = f"{_box_text(box)} is too small: an object needs {MIN_BOX_SIDE} x {MIN_BOX_SIDE} pixels"
+        raise source.rejection(text)
     if box.x1 > full[0] or box.y1 > full[1]:
+        raise source.rejection(f"{_box_text(box)} lies outside the full image of {_size_text(full)} pixels")
+    shown = (*origin, origin[0] + picture.width, origin[1] + picture.height)
+    if shown[2] > full[0] or shown[3] > full[1]:
         raise source.rejection(
-            f"{_box_text(box)} lies outside the full image of {full[0]} x {full[1]} pixels"
+            f"the crop {list(shown)} lies outside the full image of {_size_text(full)} pixels"
         )
     if box.x0 < shown[0] or box.y0 < shown[1] or box.x1 > shown[2] or box.y1 > shown[3]:
         raise source.rejection(f"{_box_text(box)} lies outside the picture, which shows {list(shown)}")
@@ -214,40 +212,42 @@ def _origin_of_crop(
 ) -> tuple[int, int]:
     """Where the picture of an ObjectView begins in the full image."""
     x, y, width, height = _roi(crop)
-    size = (picture.width, picture.height)
     if any((x, y, width, height)):
-        if size != (width, height):
-            text = f"crop has {width} x {height} pixels, the picture {size[0]} x {size[1]}"
-            raise source.rejection(text)
-        if x + width > full[0] or y + height > full[1]:
-            extent = [x, y, x + width, y + height]
-            text = f"crop {extent} lies outside the full image of {full[0]} x {full[1]} pixels"
+        if picture.size != (width, height):
+            text = f"crop has {width} x {height} pixels, the picture {_size_text(picture.size)}"
             raise source.rejection(text)
         return x, y
-    if size == full:
+    if picture.size == full:
         return 0, 0
-    if size == (box.width, box.height):
+    if picture.size == (box.width, box.height):
         return int(box.x0), int(box.y0)
     text = (
-        f"the picture has {size[0]} x {size[1]} pixels: neither the full image's {full[0]} x {full[1]} nor "
+        f"the picture has {_size_text(picture.size)} pixels: neither the full image's {_size_text(full)} nor "
     )
     raise source.rejection(
         f"{text}the box's {box.width:.0f} x {box.height:.0f}; fill crop to say what it shows"
     )
 
 
-def _box(roi: Any, name: str, source: Source) -> BoundingBox:
+@contextmanager
+def _image_errors_rejected(source: Source) -> Iterator[None]:
+    try:
+        yield
+    except ImageError as err:
+        raise source.rejection(str(err)) from err
+
+
+def _box(roi: Any) -> BoundingBox:
     x, y, width, height = _roi(roi)
-    if width < MIN_BOX_SIDE or height < MIN_BOX_SIDE:
-        text = (
-            f"{name} has {width} x {height} pixels: an object needs {MIN_BOX_SIDE} x {MIN_BOX_SIDE} at least"
-        )
-        raise source.rejection(text)
     return BoundingBox(float(x), float(y), float(x + width), float(y + height))
 
 
 def _roi(roi: Any) -> tuple[int, int, int, int]:
     return int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)
+
+
+def _size_text(size: tuple[int, int]) -> str:
+    return f"{size[0]} x {size[1]}"
 
 
 def _box_text(box: BoundingBox) -> str:
@@ -306,36 +306,34 @@ class Pairing:
             limit: Most messages that wait, of each kind and camera.
             backward_jump_ns: How far back a stamp must lie to count as a jump, and not as late.
         """
-        self._limit = limit
-        self._backward_jump_ns = backward_jump_ns
+        self.limit = limit
+        self.backward_jump_ns = backward_jump_ns
         self._queues: dict[tuple[str, Kind], _Queue] = {}
 
     def add(self, kind: Kind, arrival: Arrival, camera: str) -> list[ImagePair]:
         """Take a message in; give back each pair that it completes."""
         stamp_ns = arrival.source.stamp_ns
-        self._queue(camera, kind).follow_clock(stamp_ns)
+        self._queue(camera, kind).follow_clock(stamp_ns, self.backward_jump_ns)
         if kind == "camera_info":
-            self._queue(camera, kind).put(arrival)
+            self._queue(camera, kind).put(arrival, self.limit)
             images = [self._queue(camera, each).messages.pop(stamp_ns, None) for each in _IMAGE_KINDS]
             return [ImagePair(image, arrival) for image in images if image is not None]
         info = self._queue(camera, "camera_info").messages.get(stamp_ns)
         if info is not None:
             return [ImagePair(arrival, info)]
-        self._queue(camera, kind).put(arrival)
+        self._queue(camera, kind).put(arrival, self.limit)
         return []
 
     def clear(self) -> None:
         """Forget everything that waits."""
         self._queues.clear()
 
-    def waiting(self) -> dict[str, int]:
-        """How many images wait for their camera info, by topic."""
-        images = [queue for (_, kind), queue in self._queues.items() if kind in _IMAGE_KINDS]
-        topics = [arrival.source.topic for queue in images for arrival in queue.messages.values()]
-        return {topic: topics.count(topic) for topic in topics}
+    def waiting(self) -> int:
+        """How many images wait for their camera info."""
+        return sum(len(queue.messages) for (_, kind), queue in self._queues.items() if kind in _IMAGE_KINDS)
 
     def _queue(self, camera: str, kind: Kind) -> _Queue:
-        return self._queues.setdefault((camera, kind), _Queue(self._limit, self._backward_jump_ns))
+        return self._queues.setdefault((camera, kind), _Queue())
 
 
 _IMAGE_KINDS: tuple[Kind, ...] = ("image", "compressed")
@@ -344,21 +342,19 @@ _IMAGE_KINDS: tuple[Kind, ...] = ("image", "compressed")
 class _Queue:
     """Messages of one kind and camera by stamp, in the order of their arrival."""
 
-    def __init__(self, limit: int, backward_jump_ns: int) -> None:
+    def __init__(self) -> None:
         self.messages: OrderedDict[int, Arrival] = OrderedDict()
-        self._limit = limit
-        self._backward_jump_ns = backward_jump_ns
         self._newest_ns = 0
         self._suspect_ns: int | None = None
 
-    def put(self, arrival: Arrival) -> None:
+    def put(self, arrival: Arrival, limit: int) -> None:
         self.messages[arrival.source.stamp_ns] = arrival
-        if len(self.messages) > self._limit:
+        while len(self.messages) > limit:
             self.messages.popitem(last=False)
 
-    def follow_clock(self, stamp_ns: int) -> None:
+    def follow_clock(self, stamp_ns: int, backward_jump_ns: int) -> None:
         """Forget what lies in the future once two messages in order agree that time jumped back."""
-        if stamp_ns >= self._newest_ns - self._backward_jump_ns:
+        if stamp_ns >= self._newest_ns - backward_jump_ns:
             self._newest_ns = max(self._newest_ns, stamp_ns)
             self._suspect_ns = None
         elif self._suspect_ns is None or stamp_ns <= self._suspect_ns:

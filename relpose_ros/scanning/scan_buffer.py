@@ -21,6 +21,9 @@ SPREAD_MARGIN = np.radians(1.0)
 """How much further from all others than the most redundant view a newcomer must look, so that the noise of
 two estimates does not swap views of a camera that stands still."""
 
+_SEEN = 64
+"""Stamps remembered to tell a picture that comes raw and compressed: no transport lags by more pictures."""
+
 _logger = logging.getLogger("relpose_ros")
 
 
@@ -65,7 +68,7 @@ class ScanBuffer:
         self._on_trial: View | None = None
         self._newest_on: dict[str, int] = {}
         self._suspects: dict[str, View] = {}
-        self._declined_ns: int | None = None
+        self._seen: deque[int] = deque(maxlen=_SEEN)
         self._changed = False
         self._failed = False
         self._base: ScanEstimate | None = None
@@ -85,7 +88,7 @@ class ScanBuffer:
         newest_ns = self._newest_ns()
         if self._jumps_back(stamp_ns, topic) or newest_ns is None:
             return None
-        if stamp_ns == self._declined_ns or any(view.stamp_ns == stamp_ns for view in self._all()):
+        if stamp_ns in self._seen or any(view.stamp_ns == stamp_ns for view in self._all()):
             return Decision(False, "a view with this stamp was seen already")
         if stamp_ns <= newest_ns:
             late = f"it is {(newest_ns - stamp_ns) / 1e9:.3f} s older than the scan of {self.object_id!r}"
@@ -157,7 +160,7 @@ class ScanBuffer:
         before = nearest_angles(viewing_directions(self._base)).min()
         after = nearest_angles(viewing_directions(estimate))[-1]
         if not after > before + SPREAD_MARGIN:
-            self._decline(work.newcomer)
+            self.dropped += 1
             return False
         self._views, self._base = list(work.views), estimate
         self.dropped += 1
@@ -170,7 +173,7 @@ class ScanBuffer:
         self._failed = True
         if work.newcomer is not None:
             self._on_trial = None
-            self._decline(work.newcomer)
+            self.dropped += 1
 
     def drop_last(self) -> View | None:
         """Forget the newest view and give it back; None where there is none."""
@@ -179,6 +182,15 @@ class ScanBuffer:
             return None
         self._forget(views[-1:])
         return views[-1]
+
+    def change_settings(self, settings: ScanSettings) -> None:
+        """Go on with other settings; views that are too many now leave by the new keep policy."""
+        self._settings = settings
+        self._backward_jump_ns = round(settings.backward_jump_s * 1e9)
+        views, most = self._all(), settings.max_views
+        surplus = {"first": views[most:], "latest": views[:-most], "spread": []}[settings.keep]
+        if len(self._views) != min(len(views), most):
+            self._forget(surplus)
 
     def _take(self, view: View, topic: str) -> Decision:
         """Take a view that is newer than all others."""
@@ -192,7 +204,8 @@ class ScanBuffer:
         if full and self._settings.keep == "spread":
             self._candidates.append(view)
             if len(self._candidates) > self._settings.max_views:
-                self._decline(self._candidates.popleft())
+                self._candidates.popleft()
+                self.dropped += 1
             return Decision(True)
         if full:
             del self._views[0]
@@ -208,12 +221,9 @@ class ScanBuffer:
 
     def _note_time(self, stamp_ns: int, topic: str) -> None:
         """Time goes on in this topic: whatever lay far behind was garbage."""
+        self._seen.append(stamp_ns)
         self._newest_on[topic] = stamp_ns
         self._suspects.pop(topic, None)
-
-    def _decline(self, candidate: View) -> None:
-        self._declined_ns = candidate.stamp_ns
-        self.dropped += 1
 
     def _jumps_back(self, stamp_ns: int, topic: str) -> bool:
         # Each topic's own clock: another one may lag behind by more than any jump.
@@ -226,7 +236,7 @@ class ScanBuffer:
         ahead = [view for view in views if view.stamp_ns > first.stamp_ns]
         repeated = any(view.stamp_ns == first.stamp_ns for view in views)
         if len(ahead) == 1 and len(views) > 1 and not repeated:
-            text = "The view of %r with stamp %s is dropped: all others are older, so its stamp was wrong."
+            text = "The view of %r with stamp %s is dropped: two later messages are older than that."
             _logger.warning(text, self.object_id, stamp_text(ahead[0].stamp_ns))
             self._forget(ahead)
         elif ahead or repeated:
@@ -236,6 +246,7 @@ class ScanBuffer:
             self._forget(views)
         self._newest_on.clear()
         self._suspects.clear()
+        self._seen.clear()
 
     def _forget(self, views: list[View]) -> None:
         self.dropped += len(views)

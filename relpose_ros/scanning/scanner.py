@@ -8,9 +8,9 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, get_args
 
+from relpose_ros.errors import RelPoseError
 from relpose_ros.scanning.incoming import (
     Arrival,
-    Kind,
     Pairing,
     ViewError,
     object_id_of,
@@ -18,6 +18,9 @@ from relpose_ros.scanning.incoming import (
     stamp_text,
     view_from_image,
     view_from_object_view,
+)
+from relpose_ros.scanning.incoming import (
+    Kind as Kind,  # a word of this module's interface
 )
 from relpose_ros.scanning.scan_buffer import ScanBuffer
 from relpose_ros.views import Scan
@@ -101,7 +104,7 @@ class Statistics:
     scans: Mapping[str, ScanStatistics]
     """By object id."""
     waiting: int
-    """Images and camera infos that wait for their counterpart."""
+    """Images that wait for a camera info of their stamp."""
     failed: int
     """Estimates that ended in an error."""
     last_failure: str
@@ -132,7 +135,7 @@ class Scanner:
         # Order of acquisition: _estimating or _receiving, then _state. Views enter a scan in the order of
         # their messages although decoding takes a while, and the state stays free meanwhile.
         self._estimating = threading.Lock()
-        self._receiving = threading.RLock()
+        self._receiving = threading.Lock()
         self._state = threading.Lock()
         self._pairing = Pairing(settings.pairing_queue, round(settings.backward_jump_s * 1e9))
         self._scans: dict[str, _ScanState] = {}
@@ -230,6 +233,17 @@ class Scanner:
         of = "" if object_id is None else f" of {object_id!r}"
         return Receipt(False, object_id or "", f"There is no view{of} to drop.")
 
+    def change_settings(self, settings: ScanSettings) -> None:
+        """Go on with other settings, from the next message on. Views that are too many now leave at once."""
+        with self._receiving, self._state:
+            self._settings = settings
+            self._pairing.limit = settings.pairing_queue
+            self._pairing.backward_jump_ns = round(settings.backward_jump_s * 1e9)
+            for state in self._scans.values():
+                state.buffer.change_settings(settings)
+            while len(self._scans) > settings.max_scans:
+                self._forget_oldest_scan()
+
     def statistics(self) -> Statistics:
         """A snapshot for diagnostics."""
         with self._receiving:
@@ -241,7 +255,7 @@ class Scanner:
                     for topic, each in self._topics.items()
                 },
                 scans={object_id: state.snapshot() for object_id, state in self._scans.items()},
-                waiting=sum(waiting.values()),
+                waiting=waiting,
                 failed=self._failed,
                 last_failure=self._last_failure,
             )
@@ -299,12 +313,15 @@ class Scanner:
 
     def _begin_scan(self, object_id: str) -> _ScanState:
         if len(self._scans) >= self._settings.max_scans:
-            oldest = next(iter(self._scans))
-            views = len(self._scans.pop(oldest).buffer.views)
-            text = "The scan of %r with %d views makes room for %r: max_scans is %d."
-            _logger.info(text, oldest, views, object_id, self._settings.max_scans)
+            self._forget_oldest_scan()
         self._scans[object_id] = _ScanState(ScanBuffer(object_id, self._settings))
         return self._scans[object_id]
+
+    def _forget_oldest_scan(self) -> None:
+        oldest = next(iter(self._scans))
+        views = len(self._scans.pop(oldest).buffer.views)
+        text = "The scan of %r with %d views is forgotten to make room: max_scans is %d."
+        _logger.info(text, oldest, views, self._settings.max_scans)
 
     def _rejected(self, topic: str, object_id: str, reason: str) -> Receipt:
         with self._state:
@@ -324,8 +341,10 @@ class Scanner:
             try:
                 estimate = self._estimator.estimate(scan)
             except Exception as err:
-                text = f"The estimate of {scan.object_id!r} from {len(scan.views)} views failed: {err}"
-                _logger.error("%s; the views are kept.", text, exc_info=True)
+                text = f"The estimate of {scan.object_id!r} from {len(scan.views)} views failed: {err}."
+                # A sentence for the user needs no traceback, a defect does.
+                trace = not isinstance(err, RelPoseError)
+                _logger.error("%s The views are kept.", text, exc_info=trace)
                 with self._state:
                     state.buffer.give_up(work)
                     self._failed += 1
