@@ -29,7 +29,7 @@ class Blur(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         taps = torch.tensor([1.0, 3.0, 3.0, 1.0]) / 8
-        self.register_buffer("filt", torch.outer(taps, taps).expand(channels, 1, 4, 4).clone())
+        self.register_buffer("filt", (taps[:, None] * taps).expand(channels, 1, 4, 4).clone())
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Blur and halve."""
@@ -42,11 +42,14 @@ def _convolution(inside: int, outside: int, size: int, *, halve: bool = False) -
     return nn.Sequential(Blur(inside), convolution) if halve else convolution
 
 
-def _shortcut(inside: int, outside: int, *, halve: bool) -> nn.Sequential | None:
+def _shortcut(inside: int, outside: int, *, halve: bool, blur: bool = True) -> nn.Sequential | None:
     if not halve and inside == outside:
         return None
-    blur = [Blur(inside)] if halve else []
-    return nn.Sequential(*blur, nn.Conv2d(inside, outside, 1, bias=False), group_norm(outside))
+    before = [Blur(inside)] if halve and blur else []
+    stride = 2 if halve and not blur else 1
+    return nn.Sequential(
+        *before, nn.Conv2d(inside, outside, 1, stride=stride, bias=False), group_norm(outside)
+    )
 
 
 class Bottleneck(nn.Module):
@@ -74,17 +77,20 @@ class Bottleneck(nn.Module):
 
 
 class BasicBlock(nn.Module):
-    """Residual block 3x3, 3x3: fewer and narrower maps than a bottleneck, which is what a CPU waits for."""
+    """Residual block 3x3, 3x3 for a CPU: narrower maps than a bottleneck's, and its first convolution strides.
+
+    A blur costs more than it is worth there: its depthwise gradient took half the time of a training step.
+    """
 
     expansion = 1
 
     def __init__(self, inside: int, width: int, *, halve: bool) -> None:
         super().__init__()
-        self.conv1 = _convolution(inside, width, 3)
+        self.conv1 = nn.Conv2d(inside, width, 3, stride=2 if halve else 1, padding=1, bias=False)
         self.bn1 = group_norm(width)
-        self.conv2 = _convolution(width, width, 3, halve=halve)
+        self.conv2 = _convolution(width, width, 3)
         self.bn2 = group_norm(width)
-        self.downsample = _shortcut(inside, width, halve=halve)
+        self.downsample = _shortcut(inside, width, halve=halve, blur=False)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(B, inside, h, w) -> (B, width, h, w), or half of h and w."""
@@ -97,13 +103,16 @@ class Backbone(nn.Sequential):
     """Stem (a quarter of the resolution), then stages, each of half the resolution of the one before."""
 
     def __init__(self, preset: Preset) -> None:
-        block: type[Bottleneck | BasicBlock] = Bottleneck if preset.block == "bottleneck" else BasicBlock
-        stem = [
-            nn.Conv2d(3, preset.stem_width, 7, stride=2, padding=3, bias=False),
+        bottleneck = preset.block == "bottleneck"
+        block: type[Bottleneck | BasicBlock] = Bottleneck if bottleneck else BasicBlock
+        pooled = preset.block == "bottleneck"  # else one long stride does for stride, pool and blur
+        stem: list[nn.Module] = [
+            nn.Conv2d(3, preset.stem_width, 7, stride=2 if pooled else 4, padding=3, bias=False),
             group_norm(preset.stem_width),
             nn.ReLU(),
-            nn.Sequential(nn.MaxPool2d(2, stride=1), Blur(preset.stem_width)),
         ]
+        if pooled:
+            stem.append(nn.Sequential(nn.MaxPool2d(2, stride=1), Blur(preset.stem_width)))
         stages = []
         inside = preset.stem_width
         self.widths = []

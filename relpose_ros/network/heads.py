@@ -84,6 +84,6 @@ def _cosine_basis(side: int, count: int) -> torch.Tensor:
 
     Read through them, a match says where it is from the first step of training on.
     """
-    waves = torch.cos(math.pi * torch.outer(torch.arange(side) + 0.5, torch.arange(side)) / side)
+    waves = torch.cos(math.pi / side * (torch.arange(side) + 0.5)[:, None] * torch.arange(side))
     order = sorted((u + v, u, v) for u in range(side) for v in range(side))[1 : count + 1]
-    return torch.stack([torch.outer(waves[:, u], waves[:, v]).flatten() for _, u, v in order], -1)
+    return torch.stack([(waves[:, u, None] * waves[:, v]).flatten() for _, u, v in order], -1)

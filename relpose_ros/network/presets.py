@@ -10,9 +10,9 @@ from typing import Literal
 class CorrelationSettings:
     """How two views' local features are compared and the result is read.
 
-    Descriptors have the resolution of one backbone stage and hear of the coarser ones. Each place of view i is
-    told where in view j it is found, as ``match_width`` learned functions of the place; convolutions read the
-    image of those.
+    Descriptors have the resolution of one backbone stage and hear of the coarser ones. Each place of view i
+    is told where in view j it is found, as ``match_width`` learned functions of the place; convolutions read
+    the image of those.
     """
 
     stage: int
