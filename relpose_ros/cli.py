@@ -1,0 +1,212 @@
+"""The command line: ``relpose_ros {node, replay, pack, render, train, evaluate, convert}``.
+
+Each command is a few lines into a function that a program could call as well. What a command needs is
+imported when it runs, so that ``relpose_ros replay`` works without ROS and ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from relpose_ros.errors import RelPoseError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    Run = Callable[[argparse.Namespace], int]
+
+EXTRA_OF_MODULE = {
+    "rclpy": "ros",
+    "moderngl": "train",
+    "trimesh": "train",
+    "pycolmap": "evaluate",
+    "scipy": "evaluate",
+}
+"""Which extra brings a module that only some commands need."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code: 0, 1 with a sentence on stderr, or 130 after Ctrl-C."""
+    arguments = _parser().parse_args(argv)
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    run: Run = arguments.run
+    try:
+        return run(arguments)
+    except RelPoseError as error:
+        problem = str(error)
+    except ModuleNotFoundError as error:
+        extra = EXTRA_OF_MODULE.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        problem = (
+            f"this command needs {error.name}, which is not installed: pip install 'relpose_ros[{extra}]'"
+        )
+    except KeyboardInterrupt:
+        return 130
+    print(f"relpose_ros {arguments.command}: {problem}", file=sys.stderr)
+    return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="relpose_ros",
+        description="Camera poses, and how far to trust them, from 2 to 8 views of one object.",
+    )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    def command(name: str, run: Run, text: str) -> argparse.ArgumentParser:
+        added = commands.add_parser(name, help=text, description=text)
+        added.set_defaults(run=run)
+        return added
+
+    node = command("node", _node, "Run the ROS 2 node: images in, camera poses and their uncertainty out.")
+    _add_weights(node)
+    node.add_argument(
+        "ros_arguments", nargs=argparse.REMAINDER, help="--ros-args and what follows goes to ROS as it is"
+    )
+
+    replay = command(
+        "replay", _replay, "Run a recorded bag through the node's own code, and write a report to look at."
+    )
+    replay.add_argument("bag", type=Path, help="rosbag2 folder, or a single .mcap or .db3 file")
+    replay.add_argument("--output", type=Path, required=True, metavar="DIR", help="where the results go")
+    replay.add_argument(
+        "--topic", action="append", metavar="NAME", help="image topic to read; again for more (default: all)"
+    )
+    replay.add_argument(
+        "--config",
+        type=Path,
+        metavar="YAML",
+        help="parameter file of the node, such as config/relpose_ros.yaml",
+    )
+    _add_weights(replay)
+
+    pack = command("pack", _pack, "Turn a folder of photos with boxes (and poses, where known) into a bag.")
+    pack.add_argument("capture", type=Path, help="capture folder: images/, cameras.json, perhaps masks/")
+    pack.add_argument("--output", type=Path, required=True, metavar="BAG", help="rosbag2 folder to write")
+    pack.add_argument(
+        "--as",
+        dest="form",
+        choices=("image", "object_view"),
+        default="image",
+        help="standard messages with the box as region of interest (default), or this package's ObjectView",
+    )
+
+    evaluate = command(
+        "evaluate",
+        _evaluate,
+        "Measure poses on captures that have them, by the paper's protocol, beside baselines.",
+    )
+    evaluate.add_argument("capture", type=Path, nargs="+", help="capture folders with camera poses")
+    evaluate.add_argument(
+        "--views",
+        type=_view_counts,
+        default=_view_counts("2..8"),
+        metavar="N|N..M",
+        help="numbers of views (default: 2..8)",
+    )
+    evaluate.add_argument(
+        "--method", action="append", metavar="NAME", help="method to measure; again for more (default: all)"
+    )
+    evaluate.add_argument(
+        "--orders",
+        type=int,
+        default=5,
+        metavar="K",
+        help="random orders of each capture's views (default: 5, the paper's)",
+    )
+    evaluate.add_argument("--seed", type=int, default=0, help="seed of those orders (default: 0)")
+    evaluate.add_argument("--output", type=Path, metavar="FILE", help="JSON file for the rows")
+    _add_weights(evaluate)
+
+    convert = command(
+        "convert", _convert, "Turn a released RelPose++ checkpoint into safetensors with its origin inside."
+    )
+    convert.add_argument(
+        "source", type=Path, help="checkpoint of the authors' release (.pth), or a safetensors file"
+    )
+    convert.add_argument(
+        "--output", type=Path, required=True, metavar="FILE", help="safetensors file to write"
+    )
+    return parser
+
+
+def _add_weights(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--weights",
+        type=Path,
+        metavar="FILE",
+        help="network weights: safetensors or a released checkpoint (default: the compact ones that ship)",
+    )
+
+
+def _view_counts(text: str) -> tuple[int, ...]:
+    """``5`` or ``2..8``, as numbers."""
+    first, dots, last = text.partition("..")
+    try:
+        counts = tuple(range(int(first), int(last if dots else first) + 1))
+    except ValueError:
+        counts = ()
+    if not counts:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of views: write 5, or 2..8")
+    return counts
+
+
+def _node(arguments: argparse.Namespace) -> int:
+    from relpose_ros.node.scan_node import run_node
+
+    weights = arguments.weights
+    # Quoted as YAML, which is how ROS reads a parameter: a file may be named 12.
+    given = [] if weights is None else ["--ros-args", "-p", f"weights:='{weights}'", "--"]
+    return run_node([*given, *arguments.ros_arguments])
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    from relpose_ros.replay.replay import replay
+    from relpose_ros.scanning.settings import ScanSettings
+
+    settings = ScanSettings.from_yaml(arguments.config) if arguments.config else None
+    replay(
+        arguments.bag,
+        arguments.output,
+        topics=arguments.topic or (),
+        settings=settings,
+        weights=arguments.weights,
+    )
+    return 0
+
+
+def _pack(arguments: argparse.Namespace) -> int:
+    from relpose_ros.replay.pack import pack
+
+    pack(arguments.capture, arguments.output, form=arguments.form)
+    return 0
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from relpose_ros.captures.folder import load_capture
+    from relpose_ros.evaluation.protocol import METHODS, evaluate, posed_views, table
+
+    captures = [posed_views(load_capture(folder)) for folder in arguments.capture]
+    rows = evaluate(
+        captures,
+        arguments.views,
+        arguments.weights,
+        arguments.method or METHODS,
+        arguments.output,
+        arguments.seed,
+        orders=arguments.orders,
+    )
+    print(table(rows))
+    return 0
+
+
+def _convert(arguments: argparse.Namespace) -> int:
+    from relpose_ros.network.checkpoint import convert
+
+    convert(arguments.source, arguments.output)
+    return 0
