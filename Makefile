@@ -41,12 +41,12 @@ $(VENV)/.relpose_ros-build-tools: build_support/requirements.txt constraints.txt
 	@$(MAKE) --no-print-directory check
 	@echo "Setting up $(VENV): a few minutes the first time."
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --requirement build_support/requirements.txt
+	@$(BIN)/python -m pip install -qq --constraint constraints.txt --requirement build_support/requirements.txt
 	@touch $@
 
 $(VENV)/.relpose_ros-installed: $(VENV)/.relpose_ros-build-tools $(INSTALLED)
 	@echo "Installing relpose_ros into $(VENV)."
-	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation \
+	@$(BIN)/python -m pip install -qq --constraint constraints.txt --no-build-isolation \
 		--editable '.[ros,train,evaluate,dev]'
 	@touch $@
 
