@@ -1,0 +1,1 @@
+"""The ROS graph around a scanner: the lifecycle node, the only code that imports rclpy."""

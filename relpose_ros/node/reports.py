@@ -1,0 +1,157 @@
+"""What the node says to a person: log lines, advice about QoS, and the diagnostics."""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from typing import TYPE_CHECKING, Any
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.qos import QoSPolicyKind
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from relpose_ros.scanning.scanner import Statistics
+
+REPEAT_AFTER_S = 5.0
+"""A rejection like one that was just logged is counted, and told again after this long."""
+
+
+class LogForwarder(logging.Handler):
+    """Takes the records of a standard logger to a ROS logger, which knows the level the user asked for."""
+
+    def __init__(self, ros_logger: Any) -> None:
+        super().__init__()
+        self._ros = ros_logger
+        self.setFormatter(logging.Formatter("%(message)s"))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log one record. A line of its own for each severity: rclpy refuses a call site that changes it."""
+        text = self.format(record)
+        if record.levelno >= logging.ERROR:
+            self._ros.error(text)
+        elif record.levelno >= logging.WARNING:
+            self._ros.warning(text)
+        elif record.levelno >= logging.INFO:
+            self._ros.info(text)
+        else:
+            self._ros.debug(text)
+
+
+class Throttle:
+    """Lets the first message of a kind pass at once, and later ones every few seconds with a count.
+
+    Two sentences are of a kind when they differ in figures and quoted values alone.
+    """
+
+    def __init__(
+        self, repeat_after_s: float = REPEAT_AFTER_S, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._repeat_after_s = repeat_after_s
+        self._clock = clock
+        self._told: dict[tuple[str, str], tuple[float, int]] = {}
+
+    def pass_on(self, topic: str, sentence: str) -> str | None:
+        """The line to log, or None while the kind was told a short while ago."""
+        kind = (topic, re.sub(r"'[^']*'|\"[^\"]*\"|[-+]?[\d.]+", "#", sentence)[:200])
+        now = self._clock()
+        told, silent = self._told.get(kind, (-float("inf"), 0))
+        if now - told < self._repeat_after_s:
+            self._told[kind] = (told, silent + 1)
+            return None
+        if len(self._told) > 1000:  # Garbage can take any number of shapes.
+            self._told.clear()
+        self._told[kind] = (now, 0)
+        return f"{sentence} ({silent} more like it were not told.)" if silent else sentence
+
+
+def qos_advice(topic: str, kind: QoSPolicyKind, *, subscribing: bool) -> str:
+    """What to do about an endpoint on ``topic`` that refuses our QoS, or we refuse its.
+
+    Args:
+        topic: The topic as it is on the graph, remapped.
+        kind: The policy that does not fit.
+        subscribing: Whether our end of the topic is a subscription.
+    """
+    ours, other = ("subscription", "publisher") if subscribing else ("publisher", "subscription")
+    # A publisher must offer at least what the subscription asks for.
+    words = {
+        QoSPolicyKind.RELIABILITY: ("best_effort", "reliable"),
+        QoSPolicyKind.DURABILITY: ("volatile", "transient_local"),
+    }
+    fault = f"{topic}: a {other} has an incompatible {kind.name.lower()}, so no message passes between us."
+    if kind not in words:
+        return f"{fault} Give both ends the same {kind.name.lower()}."
+    less, more = words[kind]
+    our_value, other_value = (less, more) if subscribing else (more, less)
+    parameter = f"qos_overrides.{topic}.{ours}.{kind.name.lower()}"
+    return (
+        f"{fault} Set this node's parameter {parameter} to {our_value}, or make that {other} {other_value}."
+    )
+
+
+def diagnostic_status(
+    name: str,
+    state: str,
+    failure: str,
+    statistics: Statistics | None,
+    longest_callbacks_s: Mapping[str, float],
+    incompatible: Mapping[str, str],
+) -> DiagnosticStatus:
+    """The node's one diagnostics entry.
+
+    Args:
+        name: The node's name.
+        state: Its lifecycle state.
+        failure: Why the last configuration failed; empty where it did not.
+        statistics: The scanner's; None while there is none.
+        longest_callbacks_s: Seconds of the slowest callback so far, by topic.
+        incompatible: What to do about QoS that does not fit, by topic.
+    """
+    level, message = DiagnosticStatus.OK, state
+    if statistics is not None:
+        views = sum(scan.views for scan in statistics.scans.values())
+        message = f"{state}: {views} views of {len(statistics.scans)} objects"
+        if statistics.last_failure:
+            level, message = DiagnosticStatus.WARN, f"an estimate failed: {statistics.last_failure}"
+    if incompatible:
+        level, message = DiagnosticStatus.WARN, next(iter(incompatible.values()))
+    if failure:
+        level, message = DiagnosticStatus.ERROR, failure
+    values = [("state", state), *((f"{topic} QoS", advice) for topic, advice in incompatible.items())]
+    values += ((f"{topic} slowest callback ms", f"{1e3 * s:.2f}") for topic, s in longest_callbacks_s.items())
+    if statistics is not None:
+        values += _statistics_values(statistics)
+    return DiagnosticStatus(
+        level=level,
+        name=name,
+        message=message,
+        hardware_id="",
+        values=[KeyValue(key=key, value=value) for key, value in values],
+    )
+
+
+def _statistics_values(statistics: Statistics) -> Iterator[tuple[str, str]]:
+    for topic, counts in statistics.topics.items():
+        yield f"{topic} received", str(counts.received)
+        yield f"{topic} used", str(counts.used)
+        yield f"{topic} rejected", str(counts.rejected)
+        if counts.last_reason:
+            yield f"{topic} last rejection", counts.last_reason
+    for object_id, scan in statistics.scans.items():
+        yield f"{object_id} views", str(scan.views)
+        yield f"{object_id} views dropped", str(scan.dropped)
+        yield f"{object_id} estimates", str(scan.estimates)
+        if scan.latency_s is not None:
+            yield f"{object_id} latency s", f"{scan.latency_s:.3f}"
+        if scan.status:
+            yield f"{object_id} status", scan.status
+        if scan.weakest_pair is not None:
+            i, j = scan.weakest_pair
+            yield f"{object_id} weakest pair", f"{i}-{j} ({scan.weakest_probability:.2f} within 15 degrees)"
+    yield "waiting for a counterpart", str(statistics.waiting)
+    yield "failed estimates", str(statistics.failed)
+    if statistics.last_failure:
+        yield "last failure", statistics.last_failure
