@@ -1,14 +1,14 @@
-"""How far a network's energies can be taken as log-probabilities: fitted on held-out scans, kept with the weights."""
+"""How far a network's energies are log-probabilities: fitted on held-out scans, kept with the weights."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass, fields
-from typing import Any
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What turns energies into probabilities that hold. The defaults are those of a network nobody calibrated."""
+    """What turns energies into probabilities that hold. The defaults are those of an uncalibrated network."""
 
     temperature: float = 1.0
     """Energies are divided by it."""
@@ -21,14 +21,15 @@ class Calibration:
     distance. The defaults are cautious: the object's place across the view is read off its box, its depth
     off the box's size alone."""
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values for the weights' metadata."""
-        return asdict(self)
+    def to_json(self) -> str:
+        """As kept in the weights' metadata, under ``calibration``."""
+        return json.dumps(asdict(self))
 
     @classmethod
-    def from_json(cls, values: dict[str, Any]) -> Calibration:
-        """Reads what `to_json` wrote; unknown keys (a report stored beside it) are ignored."""
-        known = {field.name: values[field.name] for field in fields(cls) if field.name in values}
+    def from_json(cls, text: str) -> Calibration:
+        """Reads what `to_json` wrote; other keys (a report kept beside it) are passed over."""
+        stored = json.loads(text)
+        known = {field.name: stored[field.name] for field in fields(cls) if field.name in stored}
         if "translation_sigma" in known:
             known["translation_sigma"] = tuple(float(sigma) for sigma in known["translation_sigma"])
         return cls(**known)

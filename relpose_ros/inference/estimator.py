@@ -14,8 +14,8 @@ from relpose_ros.errors import RelPoseError
 from relpose_ros.estimates import CameraPose, ScanEstimate
 from relpose_ros.geometry import cameras
 from relpose_ros.inference.calibration import Calibration
-from relpose_ros.inference.global_rotations import JointSolutions, solve
-from relpose_ros.inference.pair_distribution import PairDistributions, search
+from relpose_ros.inference.global_rotations import solve
+from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 from relpose_ros.inference.uncertainty import camera_covariances, describe_pairs
 from relpose_ros.inference.verdict import judge
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
+    from relpose_ros.inference.global_rotations import JointSolutions
+    from relpose_ros.inference.pair_distribution import PairDistributions
     from relpose_ros.network.features import SceneFeatures
     from relpose_ros.network.relpose import RelPose
     from relpose_ros.views import Scan, View

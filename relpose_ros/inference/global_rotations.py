@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 
 from relpose_ros.geometry import so3
-from relpose_ros.inference.pair_distribution import PairDistributions
-from relpose_ros.inference.pair_energies import PairEnergies
+
+if TYPE_CHECKING:
+    from relpose_ros.inference.pair_distribution import PairDistributions
+    from relpose_ros.inference.pair_energies import PairEnergies
 
 
 @dataclass(frozen=True)
@@ -26,12 +29,15 @@ class AscentSettings:
     """Partial solutions kept while cameras join."""
     starts: int = 6
     """Complete ones that are climbed."""
-    radii: tuple[float, ...] = tuple(math.radians(a) for a in (16, 10, 6, 4, 2.5, 1.5, 0.8))
+    climb_stride: float = math.radians(4)
+    """First step of a joint climb, rad."""
+    climb_steps: int = 16
+    finalists: int = 3
+    """Climbers that go on to sweeps; the others are kept as runners-up."""
+    radii: tuple[float, ...] = tuple(math.radians(a) for a in (4, 2, 1))
     """Neighbourhood of each sweep over the cameras, rad."""
-    halving: int = 2
-    """After every so many sweeps the worse half of the climbers stops."""
-    polish_steps: int = 24
-    """Joint gradient steps at the end."""
+    polish_stride: float = math.radians(0.5)
+    polish_steps: int = 16
     distinct: float = math.radians(10)
     """Solutions are different where some camera differs by more, rad."""
 
@@ -56,29 +62,28 @@ def joint_scores(energies: PairEnergies, rotations: torch.Tensor) -> torch.Tenso
 def solve(
     energies: PairEnergies, distributions: PairDistributions, settings: AscentSettings = AscentSettings()
 ) -> JointSolutions:
-    """The joint maximum and the runners-up that were met on the way."""
+    """The joint maximum and the other local maxima that were met on the way."""
     rotations = _grow(energies, distributions, settings)
+    rotations, scores = _best(energies, rotations, settings.starts, settings.distinct)
+    rotations = _climb(energies, rotations, settings.climb_stride, settings.climb_steps)
+    rotations, scores = _best(energies, rotations, settings.starts, settings.distinct)
+    finalists, others = rotations[: settings.finalists], rotations[settings.finalists :]
+    jumped = _sweep(energies, distributions, finalists[:1], settings.climb_stride)
+    finalists, _ = _best(energies, torch.cat([finalists, jumped]), settings.finalists, settings.distinct)
+    for radius in settings.radii:
+        finalists = _sweep(energies, None, finalists, radius)
+    finalists = _climb(energies, finalists, settings.polish_stride, settings.polish_steps)
+    rotations, scores = _best(energies, torch.cat([finalists, others]), settings.starts, settings.distinct)
+    return JointSolutions(rotations @ rotations[:, :1].mT, scores)
+
+
+def _best(
+    energies: PairEnergies, rotations: torch.Tensor, count: int, angle: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The best distinct ones of some solutions, best first. -> (<= count, N, 3, 3), (<= count,)."""
     scores = joint_scores(energies, rotations)
-    keep = _distinct(rotations, scores, settings.starts, settings.distinct)
-    rotations, scores = rotations[keep], scores[keep]
-    done_rotations, done_scores = [], []
-    for sweep, radius in enumerate(settings.radii):
-        modes = distributions if sweep < 2 else None
-        rotations = _sweep(energies, modes, rotations, radius)
-        if sweep % settings.halving == settings.halving - 1 and len(rotations) > 1:
-            scores = joint_scores(energies, rotations)
-            keep = _distinct(rotations, scores, (len(rotations) + 1) // 2, settings.distinct)
-            rest = torch.ones(len(rotations), dtype=torch.bool)
-            rest[keep] = False
-            done_rotations.append(rotations[rest])
-            done_scores.append(scores[rest])
-            rotations = rotations[keep]
-    rotations = _polish(energies, rotations, math.radians(0.5), settings.polish_steps)
-    rotations = torch.cat([rotations, *done_rotations])
-    scores = torch.cat([joint_scores(energies, rotations[: len(rotations) - sum(map(len, done_scores))]), *done_scores])
-    keep = _distinct(rotations, scores, settings.starts, settings.distinct)
-    rotations, scores = rotations[keep], scores[keep]
-    return JointSolutions(rotations @ rotations[:, :1].transpose(-1, -2), scores)
+    keep = _distinct(rotations, scores, count, angle)
+    return rotations[keep], scores[keep]
 
 
 def spanning_order(strengths: torch.Tensor, pair_of: torch.Tensor) -> list[int]:
@@ -135,7 +140,10 @@ def _mode_candidates(
 def _conditional(
     energies: PairEnergies, rotations: torch.Tensor, camera: int, others: list[int], candidates: torch.Tensor
 ) -> torch.Tensor:
-    """Energy of one camera's pairs at each candidate, the others held. (S, N, 3, 3), (S, C, 3, 3) -> (S, C)."""
+    """Energy of one camera's pairs at each candidate, the others held.
+
+    (S, N, 3, 3) and (S, C, 3, 3) -> (S, C).
+    """
     pairs = energies.pair_of[camera, others]
     placed = rotations[:, others].transpose(0, 1)[:, :, None]  # (O, S, 1, 3, 3)
     relative = candidates @ placed.transpose(-1, -2)  # (O, S, C, 3, 3): camera from other
@@ -145,7 +153,10 @@ def _conditional(
 
 
 def _distinct(rotations: torch.Tensor, scores: torch.Tensor, count: int, angle: float) -> torch.Tensor:
-    """Positions of the best solutions of which no two agree in all cameras. (S, N, 3, 3), (S,) -> (<= count,)."""
+    """Positions of the best solutions of which no two agree in all cameras, best first.
+
+    (S, N, 3, 3) and (S,) -> (<= count,).
+    """
     least_trace = 1 + 2 * math.cos(angle)
     flat = (rotations @ rotations[:, :1].transpose(-1, -2)).flatten(2)  # (S, N, 9)
     left = scores.clone()
@@ -162,7 +173,7 @@ def _distinct(rotations: torch.Tensor, scores: torch.Tensor, count: int, angle: 
 
 
 def _neighbourhood() -> torch.Tensor:
-    """Tangent offsets inside the unit ball: 26 directions at its edge, the six axes at half of it. -> (33, 3)."""
+    """Tangent offsets: the centre, 26 directions on the unit sphere, the six axes at half. -> (33, 3)."""
     axis = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
     cube = torch.cartesian_prod(axis, axis, axis)
     length = cube.norm(dim=1, keepdim=True)
@@ -192,7 +203,7 @@ def _sweep(
     return rotations
 
 
-def _polish(energies: PairEnergies, rotations: torch.Tensor, stride: float, steps: int) -> torch.Tensor:
+def _climb(energies: PairEnergies, rotations: torch.Tensor, stride: float, steps: int) -> torch.Tensor:
     """Climbs all rotations together along the joint gradient (Adam's scaling, best point kept)."""
     here, best = rotations, rotations
     best_score = torch.full((len(rotations),), -math.inf, dtype=torch.float64)

@@ -10,17 +10,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from relpose_ros.geometry import so3, so3_grid
-from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
+
+if TYPE_CHECKING:
+    from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How the grid is searched; `benchmarks/solver.py --search-table` prints what each choice costs and finds."""
+    """How the grid is searched: ``benchmarks/solver.py --search-table`` prints what each choice finds."""
 
     level: int = 1
     """The level evaluated in full: 72 * 8^level cells a pair, 30 degrees apart at level 1."""
@@ -61,7 +64,7 @@ class PairDistributions:
 
     @cached_property
     def mode_log_densities(self) -> torch.Tensor:
-        """Log density of each mode relative to uniform, at temperature one: comparable between pairs. -> (P, M)."""
+        """Log density of each mode relative to uniform: comparable between pairs. -> (P, M)."""
         return self.mode_energies - self.log_normaliser()[:, None]
 
 
@@ -84,11 +87,12 @@ def search(
 
     rotations = torch.cat([_grid_tensor(at)[index] for at, index, _ in kept], 1)
     scores = torch.cat([value for _, _, value in kept], 1).double()
-    volumes = torch.cat([torch.full((len(c[0]),), -math.log(so3_grid.size(at))) for at, c, _ in kept]).double()
-    spacings = torch.cat([torch.full((len(c[0]),), so3_grid.cell_spacing(at)) for at, c, _ in kept]).double()
-    modes, mode_energies = _peaks(rotations, scores, settings)
-    modes, mode_energies = _refine_modes(energies, modes, mode_energies, so3_grid.cell_spacing(level), settings)
-    return PairDistributions(rotations, scores, volumes, spacings, modes, mode_energies)
+    levels = [at for at, index, _ in kept for _ in range(index.shape[1])]
+    log_volumes = torch.tensor([-math.log(so3_grid.size(at)) for at in levels], dtype=torch.float64)
+    spacings = torch.tensor([so3_grid.cell_spacing(at) for at in levels], dtype=torch.float64)
+    peaks = _peaks(rotations, scores, settings)
+    modes, mode_energies = _refine_modes(energies, *peaks, so3_grid.cell_spacing(level), settings)
+    return PairDistributions(rotations, scores, log_volumes, spacings, modes, mode_energies)
 
 
 def _grid_tensor(level: int) -> torch.Tensor:

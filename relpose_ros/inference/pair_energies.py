@@ -52,7 +52,7 @@ class GridEmbeddings:
         """(72 * 8^level, H) embeddings of a whole level; 38 MB at level 3 of the published size."""
         if level not in self._levels:
             rotations = torch.from_numpy(np.array(so3_grid.grid(level))).float()
-            parts = [self._model.embed_relative(part) for part in rotations.split(ROWS)]
+            parts = [self._model.embed_relative(part) for part in torch.split(rotations, ROWS)]
             self._levels[level] = torch.cat(parts)
         return self._levels[level]
 

@@ -32,7 +32,7 @@ LEAST_WEIGHT = 0.02
 RUNNER_UP_WEIGHT = 0.15
 """A second mode matters from here on: about one chance in seven of being the true one."""
 FLOOR = math.radians(0.1)
-"""The solver's own accuracy, rad, and the standard deviation stated for what the gauge fixes by definition."""
+"""The solver's own accuracy, rad: the standard deviation stated for what the gauge fixes by definition."""
 UNIFORM_VARIANCE = (math.pi**2 / 3 + 2) / 3
 """Per axis, rad^2, of the rotation vector of a uniformly random rotation: the most that can be unknown."""
 CURVATURE_RADIUS = math.radians(6)
@@ -64,16 +64,15 @@ def describe_pairs(
         angles = _angles(distributions.rotations[pair], centres)  # (L, M)
         nearest = angles.argmin(1)
         owned = _inside(angles.min(1).values, BASIN, distributions.spacings) * mass
-        weights = torch.stack([owned[nearest == mode].sum() for mode in range(len(centres))])
+        basins = owned * (nearest[None] == torch.arange(len(centres))[:, None])  # (M, L)
+        weights = basins.sum(1)
         by_weight = torch.argsort(weights, descending=True, stable=True)
         strongest = int(by_weight[0])
         modes = tuple(
             Mode(
                 camera_j_from_camera_i=centres[mode].numpy(),
                 weight=float(weights[mode]),
-                covariance=_second_moment(
-                    distributions, pair, centres[mode], torch.where(nearest == mode, owned, torch.zeros_like(owned))
-                )
+                covariance=_second_moment(distributions, pair, centres[mode], basins[mode])
                 * calibration.pair_spread,
             )
             for mode in by_weight.tolist()
@@ -86,7 +85,8 @@ def describe_pairs(
                 i=int(energies.i[pair]),
                 j=int(energies.j[pair]),
                 camera_j_from_camera_i=modes[0].camera_j_from_camera_i,
-                covariance=_second_moment(distributions, pair, centres[strongest], mass) * calibration.pair_spread,
+                covariance=_second_moment(distributions, pair, centres[strongest], mass)
+                * calibration.pair_spread,
                 entropy=float(entropies[pair]),
                 probability_within_15_deg=_share(angles[:, strongest], mass, distributions.spacings),
                 modes=modes,
@@ -111,7 +111,7 @@ def _angles(rotations: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
 
 
 def _inside(angles: torch.Tensor, radius: float, spacings: torch.Tensor) -> torch.Tensor:
-    """Which share of each cell lies within a radius of a rotation, its border taken as straight. (L,) -> (L,)."""
+    """Which share of each cell lies within a radius of a rotation, the border taken as flat. (L,) -> (L,)."""
     return ((radius - angles) / spacings + 0.5).clamp(0, 1)
 
 
@@ -179,13 +179,14 @@ def camera_covariances(
         turn = np.concatenate([-object_from_camera @ so3.hat(translations[camera]), -object_from_camera])
         covariances[camera] = turn @ rotation_part @ turn.T
         covariances[camera, :3, :3] += object_from_camera @ translation_part @ object_from_camera.T
-    return (covariances + covariances.transpose(0, 2, 1)) / 2
+    return np.asarray((covariances + covariances.transpose(0, 2, 1)) / 2)
 
 
 def _joint_information(energies: PairEnergies, rotations: torch.Tensor, temperature: float) -> FloatArray:
     """Curvature of the tempered joint energy in the cameras' own axes, the first camera held.
 
-    With R_ij = R_j R_i^T, turns e_i and e_j of the cameras turn R_ij by e_j - R_ij e_i. -> (3 N - 3, 3 N - 3).
+    With R_ij = R_j R_i^T, turns e_i and e_j of the cameras turn R_ij by e_j - R_ij e_i.
+    (N, 3, 3) -> (3 N - 3, 3 N - 3).
     """
     relative = rotations[energies.j] @ rotations[energies.i].transpose(-1, -2)
     curvatures = _curvatures(energies, relative) / temperature

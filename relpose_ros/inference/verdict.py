@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 TRUSTED = 0.6
 """A pair is trusted when this much of its probability lies within 15 degrees of the final poses: more likely
 right than wrong with a margin, and impossible for a pair with two equal modes."""
+HARDLY_ANYTHING = 2
+"""Percent within 15 degrees below which a number would claim more than is known; uniform has 0.1."""
 LARGEST_DEVIATION = math.radians(12)
 """Largest standard deviation (worst axis) of a camera's rotation: within 15 degrees more often than not."""
 
@@ -68,6 +70,8 @@ def _weakness(pair: PairRotation) -> str:
     if pair.probability_within_15_deg >= TRUSTED:
         return f"{name} contradicts the others by about {math.degrees(pair.solution_angle):.0f} degrees"
     chance = 100 * pair.probability_within_15_deg
+    if chance < HARDLY_ANYTHING:
+        return f"{name} says hardly anything of its rotation"
     return f"{name} knows its rotation to 15 degrees with {chance:.0f}% only"
 
 

@@ -74,3 +74,9 @@ def fisher_scene() -> type[FisherScene]:
 @pytest.fixture
 def cameras_around() -> object:
     return around_object
+
+
+@pytest.fixture(scope="session")
+def fisher_scene_type() -> tuple[type[FisherScene], object]:
+    """For tests under hypothesis, which forbids fixtures made anew for each test."""
+    return FisherScene, around_object
