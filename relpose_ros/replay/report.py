@@ -200,7 +200,7 @@ def _distribution(
     pair: PairRotation, estimate: ScanEstimate, comparison: Comparison | None, cells: Cells | None
 ) -> dict[str, Any]:
     """What the figure of one pair shows: [yaw, pitch, roll, probability] of each rotation, and the marks."""
-    rotations, masses = (_draw(pair) if cells is None else _most_probable(cells))
+    rotations, masses = _draw(pair) if cells is None else _most_probable(cells)
     by_view = {camera.view: camera.object_from_camera for camera in estimate.cameras}
     solution = by_view[pair.j].T @ by_view[pair.i]
     points = np.concatenate([yaw_pitch_roll(rotations), masses[:, None]], axis=1)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -15,6 +14,10 @@ from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import look_at, translation_of
 from relpose_ros.replay.comparison import TruePose
 from relpose_ros.views import BoundingBox, Intrinsics, Scan, View
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
 
 SIDE = 48
 
@@ -97,10 +100,15 @@ class FakeEstimator:
         )  # fmt: skip
 
 
-def stamp(types: dict[str, Any], stamp_ns: int, frame_id: str = "camera") -> Any:
-    seconds, nanoseconds = divmod(stamp_ns, 10**9)
-    time = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-    return types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
+@pytest.fixture
+def fake_estimator() -> type[FakeEstimator]:
+    """The class: test modules cannot import this one."""
+    return FakeEstimator
+
+
+@pytest.fixture
+def write_posed_capture() -> Callable[..., list[TruePose]]:
+    return write_capture
 
 
 @pytest.fixture

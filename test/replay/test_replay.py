@@ -1,0 +1,299 @@
+from __future__ import annotations
+
+import json
+import logging
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from relpose_ros.geometry import so3
+from relpose_ros.replay import bags
+from relpose_ros.replay.bags import BagReader, BagWriter
+from relpose_ros.replay.pack import pack
+from relpose_ros.replay.replay import ReplayError, replay
+from relpose_ros.scanning.settings import ScanSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+    from pathlib import Path
+
+    from relpose_ros.replay.bags import Record
+    from relpose_ros.replay.comparison import TruePose
+
+    Fake = Callable[..., Any]
+    Capture = tuple[Path, list[TruePose]]
+
+OUTPUTS = {"estimates", "scan.json", "report.html"}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(file.relative_to(folder)): file.read_bytes()
+        for file in sorted(folder.rglob("*"))
+        if file.is_file() and file.name != "report.html"
+    }
+
+
+def records(path: Path) -> list[Record]:
+    with BagReader(path) as bag:
+        return list(bag.records(bag.topics))
+
+
+def rewrite(source: Path, target: Path, change: Callable[[Record], Iterable[Record]]) -> None:
+    """A copy of a bag with each message changed, left out or repeated."""
+    with BagReader(source) as bag, BagWriter(target) as writer:
+        changed = [new for record in bag.records(bag.topics) for new in change(record)]
+        topics = dict.fromkeys(record.topic for record in changed)
+        for topic in topics:
+            writer.add_topic(topic, next(r.message.__msgtype__ for r in changed if r.topic == topic))
+        for record in changed:
+            writer.write(record.topic, record.log_time_ns, record.message)
+
+
+@pytest.mark.parametrize("form", ["image", "object_view"])
+def test_one_estimate_for_each_view_from_the_second_on(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, form: Any
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "bag", form=form)
+    replay(tmp_path / "bag", tmp_path / "out", estimator=fake_estimator(truth))
+    assert {each.name for each in (tmp_path / "out").iterdir()} == OUTPUTS
+
+    scan = json.loads((tmp_path / "out/scan.json").read_text(), parse_constant=pytest.fail)
+    assert set(scan) == {"object_id", "views", "estimates"}
+    assert scan["object_id"] == {"image": "object", "object_view": "cup"}[form]
+    assert scan["views"] == [
+        {
+            "index": k,
+            "stamp_ns": (k + 1) * 10**9,
+            "frame_id": "camera_optical_frame",
+            "box": [14.0, 10.0, 42.0, 38.0],
+        }
+        for k in range(5)
+    ]
+    assert [each["views"] for each in scan["estimates"]] == [list(range(n)) for n in (2, 3, 4, 5)]
+    for estimate in scan["estimates"]:
+        assert set(estimate) == {"views", "scale_known", "status", "cameras", "pairs"}
+        count = len(estimate["views"])
+        assert [camera["view"] for camera in estimate["cameras"]] == list(range(count))
+        assert [(p["i"], p["j"]) for p in estimate["pairs"]] == [
+            (i, j) for i in range(count) for j in range(i + 1, count)
+        ]
+        for camera in estimate["cameras"]:
+            assert set(camera) == {"view", "position", "orientation_xyzw", "covariance"}
+            assert [len(camera[k]) for k in ("position", "orientation_xyzw", "covariance")] == [3, 4, 36]
+        for pair in estimate["pairs"]:
+            assert set(pair) == {
+                *("i", "j", "orientation_xyzw", "covariance", "probability_within_15_deg"),
+                *("entropy", "ambiguous", "modes"),
+            }
+            assert len(pair["covariance"]) == 9
+            for mode in pair["modes"]:
+                assert set(mode) == {"orientation_xyzw", "weight", "covariance"}
+    # The numbers are the estimator's own.
+    last = scan["estimates"][-1]["cameras"]
+    relative = so3.from_quaternion_xyzw(last[3]["orientation_xyzw"])
+    wanted = truth[0].world_from_camera.T @ truth[3].world_from_camera
+    np.testing.assert_allclose(relative, wanted, atol=1e-9)
+
+
+def test_the_bag_holds_what_the_node_would_have_sent(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "bag")
+    replay(
+        tmp_path / "bag",
+        tmp_path / "out",
+        settings=ScanSettings(object_frame="the_cup"),
+        estimator=fake_estimator(truth),
+    )
+    sent = records(tmp_path / "out/estimates")
+    assert [(each.topic, each.log_time_ns) for each in sent] == [
+        (f"/scan_node/{name}", second * 10**9)
+        for second in (2, 3, 4, 5)
+        for name in ("estimate", "poses", "markers")
+    ]
+    estimate, poses, markers = (each.message for each in sent[-3:])
+    assert [each.header.frame_id for each in (estimate, poses)] == ["the_cup"] * 2
+    assert estimate.header.stamp.sec == 5
+    assert estimate.seconds == 0
+    assert [camera.header.stamp.sec for camera in estimate.cameras] == [1, 2, 3, 4, 5]
+    assert len(poses.poses) == 5
+    assert poses.poses[3].position.x == estimate.cameras[3].pose.pose.position.x
+    assert len(markers.markers) > 10
+
+
+def test_two_runs_write_the_same_bytes(tmp_path: Path, capture: Capture, fake_estimator: Fake) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "bag")
+    for name in ("one", "two"):
+        replay(tmp_path / "bag", tmp_path / name, estimator=fake_estimator(truth))
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+    assert set(contents(tmp_path / "one")) == {
+        "scan.json",
+        "estimates/estimates.mcap",
+        "estimates/metadata.yaml",
+    }
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+@pytest.mark.parametrize("single", [False, True])
+def test_every_kind_of_bag_gives_the_same_answer(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, plugin: StoragePlugin, single: bool
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "reference")
+    replay(tmp_path / "reference", tmp_path / "wanted", estimator=fake_estimator(truth))
+    store = bags._base_store()
+    with Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as writer:
+        connections: dict[str, Any] = {}
+        for record in records(tmp_path / "reference"):
+            kind = record.message.__msgtype__
+            if record.topic not in connections:
+                connections[record.topic] = writer.add_connection(record.topic, kind, typestore=store)
+            data = store.serialize_cdr(record.message, kind)
+            writer.write(connections[record.topic], record.log_time_ns, data)
+    path = next((tmp_path / "bag").glob("bag.*")) if single else tmp_path / "bag"
+    replay(path, tmp_path / "out", estimator=fake_estimator(truth))
+    assert contents(tmp_path / "out") == contents(tmp_path / "wanted")
+
+
+def test_every_object_has_its_own_folder(tmp_path: Path, capture: Capture, fake_estimator: Fake) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "cup_bag", form="object_view")
+
+    def repeat(record: Record) -> Iterable[Record]:
+        if record.topic != "/object_view":
+            return
+        for name in ["a/b", "../..", "Mug", "mug", *(["lonely"] if record.log_time_ns == 10**9 else [])]:
+            changed = bags._base_store().types[record.message.__msgtype__](
+                **{**vars(record.message), "object_id": name}
+            )
+            yield record._replace(message=changed)
+
+    rewrite(tmp_path / "cup_bag", tmp_path / "bag", repeat)
+    settings = ScanSettings(max_scans=8)
+    replay(tmp_path / "bag", tmp_path / "out", settings=settings, estimator=fake_estimator(truth))
+    found = {}
+    for each in (tmp_path / "out").iterdir():
+        assert {inner.name for inner in each.iterdir()} == OUTPUTS
+        found[each.name] = json.loads((each / "scan.json").read_text())["object_id"]
+    assert found == {"a_b": "a/b", "_": "../..", "Mug": "Mug", "mug-2": "mug"}
+    # An earlier output of several objects is replaced like that of one.
+    replay(tmp_path / "cup_bag", tmp_path / "out", estimator=fake_estimator(truth))
+    assert {each.name for each in (tmp_path / "out").iterdir()} == OUTPUTS
+
+
+def test_views_that_make_way_are_numbered_once(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "bag")
+    settings = ScanSettings(max_views=3, keep="latest")
+    replay(tmp_path / "bag", tmp_path / "out", settings=settings, estimator=fake_estimator(truth))
+    scan = json.loads((tmp_path / "out/scan.json").read_text())
+    assert [view["stamp_ns"] for view in scan["views"]] == [k * 10**9 for k in (1, 2, 3, 4, 5)]
+    assert [each["views"] for each in scan["estimates"]] == [[0, 1], [0, 1, 2], [1, 2, 3], [2, 3, 4]]
+    assert [camera["view"] for camera in scan["estimates"][-1]["cameras"]] == [0, 1, 2]
+
+
+def test_rejected_messages_are_counted_by_their_reason(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "good")
+
+    def spoil(record: Record) -> Iterable[Record]:
+        if record.topic == "/camera_info" and record.log_time_ns in (2 * 10**9, 4 * 10**9):
+            record.message.roi.width = 500 + record.log_time_ns // 10**9
+        yield record
+
+    rewrite(tmp_path / "good", tmp_path / "bag", spoil)
+    with caplog.at_level(logging.WARNING, "relpose_ros"):
+        replay(tmp_path / "bag", tmp_path / "out", estimator=fake_estimator(truth))
+    assert "2 rejected: " in caplog.text
+    assert "outside the full image of 64 x 48" in caplog.text
+    scan = json.loads((tmp_path / "out/scan.json").read_text())
+    assert [view["stamp_ns"] // 10**9 for view in scan["views"]] == [1, 3, 5]
+
+
+def test_no_estimate_is_an_error_that_says_why(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "one", views=[0])
+    with pytest.raises(ReplayError, match="one view could be used, and an estimate takes two"):
+        replay(tmp_path / "one", tmp_path / "out", estimator=fake_estimator(truth))
+
+    pack(folder, tmp_path / "good")
+
+    def no_box(record: Record) -> Iterable[Record]:
+        if record.topic == "/camera_info":
+            record.message.roi.width = 500
+        yield record
+
+    rewrite(tmp_path / "good", tmp_path / "bad", no_box)
+    with pytest.raises(ReplayError, match=r"no view could be used.*5 messages were rejected, such as"):
+        replay(tmp_path / "bad", tmp_path / "out", estimator=fake_estimator(truth))
+
+    def late(record: Record) -> Iterable[Record]:
+        if record.topic == "/camera_info":
+            record.message.header.stamp.nanosec = 1
+        yield record
+
+    rewrite(tmp_path / "good", tmp_path / "apart", late)
+    with pytest.raises(ReplayError, match="same stamp"):
+        replay(tmp_path / "apart", tmp_path / "out", estimator=fake_estimator(truth))
+
+    class Broken:
+        def estimate(self, scan: Any) -> Any:
+            raise RuntimeError("no luck")
+
+    with pytest.raises(ReplayError, match="no luck"):
+        replay(tmp_path / "good", tmp_path / "out", estimator=Broken())
+    assert not (tmp_path / "out").exists()
+
+
+def test_only_an_earlier_replay_is_replaced(tmp_path: Path, capture: Capture, fake_estimator: Fake) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "bag")
+    output = tmp_path / "out"
+    output.mkdir()
+    replay(tmp_path / "bag", output, estimator=fake_estimator(truth))
+    before = contents(output)
+    (output / "scan.json").write_text("{}")
+    replay(tmp_path / "bag", output, estimator=fake_estimator(truth))
+    assert contents(output) == before
+
+    (output / "thesis.tex").write_text("years of work")
+    with pytest.raises(ReplayError, match=r"holds thesis\.tex, which no replay wrote"):
+        replay(tmp_path / "bag", output, estimator=fake_estimator(truth))
+    assert (output / "thesis.tex").read_text() == "years of work"
+    with pytest.raises(ReplayError, match="is a file"):
+        replay(tmp_path / "bag", output / "thesis.tex", estimator=fake_estimator(truth))
+    # The bag itself is no output either, although its folder could be named by mistake.
+    with pytest.raises(ReplayError, match="which no replay wrote"):
+        replay(tmp_path / "bag", tmp_path / "bag", estimator=fake_estimator(truth))
+    assert {each.name for each in tmp_path.iterdir()} == {"cup", "bag", "out"}
+
+
+def test_a_true_pose_that_is_none_is_left_out(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "good")
+
+    def spoil(record: Record) -> Iterable[Record]:
+        if record.topic == "/ground_truth/pose" and record.log_time_ns == 10**9:
+            record.message.pose.position.x = math.nan
+        yield record
+
+    rewrite(tmp_path / "good", tmp_path / "bag", spoil)
+    with caplog.at_level(logging.WARNING, "relpose_ros"):
+        replay(tmp_path / "bag", tmp_path / "out", estimator=fake_estimator(truth))
+    assert "stamp 1000000000 ns is no pose" in caplog.text
+    assert "NaN" not in (tmp_path / "out/report.html").read_text()
