@@ -1,6 +1,7 @@
 """Anti-aliased residual network with group norm (R. Zhang, ICML 2019; He et al. 2016).
 
-Every reduction of resolution is a convolution with stride 1 followed by a blur with stride 2.
+Where a preset blurs, resolution is halved by a blur beside convolutions of stride 1; else by their stride,
+because the depthwise gradient of the blurs would take half of a training step on a CPU.
 Module and attribute names are those of the released checkpoints.
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional
@@ -28,8 +30,8 @@ class Blur(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        taps = torch.tensor([1.0, 3.0, 3.0, 1.0]) / 8
-        self.register_buffer("filt", (taps[:, None] * taps).expand(channels, 1, 4, 4).clone())
+        taps = np.array([1, 3, 3, 1], np.float32) / 8
+        self.register_buffer("filt", torch.from_numpy(np.tile(np.outer(taps, taps), (channels, 1, 1, 1))))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Blur and halve."""
@@ -37,19 +39,16 @@ class Blur(nn.Module):
         return functional.conv2d(padded, self.filt, stride=2, groups=len(self.filt))
 
 
-def _convolution(inside: int, outside: int, size: int, *, halve: bool = False) -> nn.Module:
-    convolution = nn.Conv2d(inside, outside, size, padding=size // 2, bias=False)
-    return nn.Sequential(Blur(inside), convolution) if halve else convolution
+def _convolution(inside: int, outside: int, size: int, stride: int = 1) -> nn.Conv2d:
+    return nn.Conv2d(inside, outside, size, stride=stride, padding=size // 2, bias=False)
 
 
-def _shortcut(inside: int, outside: int, *, halve: bool, blur: bool = True) -> nn.Sequential | None:
+def _shortcut(inside: int, outside: int, *, halve: bool, blurs: bool) -> nn.Sequential | None:
     if not halve and inside == outside:
         return None
-    before = [Blur(inside)] if halve and blur else []
-    stride = 2 if halve and not blur else 1
-    return nn.Sequential(
-        *before, nn.Conv2d(inside, outside, 1, stride=stride, bias=False), group_norm(outside)
-    )
+    blur = [Blur(inside)] if halve and blurs else []
+    stride = 2 if halve and not blurs else 1
+    return nn.Sequential(*blur, _convolution(inside, outside, 1, stride), group_norm(outside))
 
 
 class Bottleneck(nn.Module):
@@ -57,16 +56,17 @@ class Bottleneck(nn.Module):
 
     expansion = 4
 
-    def __init__(self, inside: int, width: int, *, halve: bool) -> None:
+    def __init__(self, inside: int, width: int, *, halve: bool, blurs: bool) -> None:
         super().__init__()
         outside = width * self.expansion
+        last = _convolution(width, outside, 1)
         self.conv1 = _convolution(inside, width, 1)
         self.bn1 = group_norm(width)
-        self.conv2 = _convolution(width, width, 3)
+        self.conv2 = _convolution(width, width, 3, stride=2 if halve and not blurs else 1)
         self.bn2 = group_norm(width)
-        self.conv3 = _convolution(width, outside, 1, halve=halve)
+        self.conv3 = nn.Sequential(Blur(width), last) if halve and blurs else last
         self.bn3 = group_norm(outside)
-        self.downsample = _shortcut(inside, outside, halve=halve)
+        self.downsample = _shortcut(inside, outside, halve=halve, blurs=blurs)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(B, inside, h, w) -> (B, outside, h, w), or half of h and w."""
@@ -77,20 +77,18 @@ class Bottleneck(nn.Module):
 
 
 class BasicBlock(nn.Module):
-    """Residual block 3x3, 3x3 for a CPU: narrower maps than a bottleneck's, and its first convolution strides.
-
-    A blur costs more than it is worth there: its depthwise gradient took half the time of a training step.
-    """
+    """Residual block 3x3, 3x3: fewer and narrower maps than a bottleneck's, which is what a CPU waits for."""
 
     expansion = 1
 
-    def __init__(self, inside: int, width: int, *, halve: bool) -> None:
+    def __init__(self, inside: int, width: int, *, halve: bool, blurs: bool) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(inside, width, 3, stride=2 if halve else 1, padding=1, bias=False)
+        last = _convolution(width, width, 3)
+        self.conv1 = _convolution(inside, width, 3, stride=2 if halve and not blurs else 1)
         self.bn1 = group_norm(width)
-        self.conv2 = _convolution(width, width, 3)
+        self.conv2 = nn.Sequential(Blur(width), last) if halve and blurs else last
         self.bn2 = group_norm(width)
-        self.downsample = _shortcut(inside, width, halve=halve, blur=False)
+        self.downsample = _shortcut(inside, width, halve=halve, blurs=blurs)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(B, inside, h, w) -> (B, width, h, w), or half of h and w."""
@@ -105,13 +103,12 @@ class Backbone(nn.Sequential):
     def __init__(self, preset: Preset) -> None:
         bottleneck = preset.block == "bottleneck"
         block: type[Bottleneck | BasicBlock] = Bottleneck if bottleneck else BasicBlock
-        pooled = preset.block == "bottleneck"  # else one long stride does for stride, pool and blur
         stem: list[nn.Module] = [
-            nn.Conv2d(3, preset.stem_width, 7, stride=2 if pooled else 4, padding=3, bias=False),
+            _convolution(3, preset.stem_width, 7, stride=2 if preset.blurs else 4),
             group_norm(preset.stem_width),
             nn.ReLU(),
         ]
-        if pooled:
+        if preset.blurs:
             stem.append(nn.Sequential(nn.MaxPool2d(2, stride=1), Blur(preset.stem_width)))
         stages = []
         inside = preset.stem_width
@@ -119,13 +116,15 @@ class Backbone(nn.Sequential):
         for stage, (width, depth) in enumerate(zip(preset.stage_widths, preset.stage_depths, strict=True)):
             blocks = []
             for position in range(depth):
-                blocks.append(block(inside, width, halve=stage > 0 and position == 0))
+                halve = stage > 0 and position == 0
+                blocks.append(block(inside, width, halve=halve, blurs=preset.blurs))
                 inside = width * block.expansion
             stages.append(nn.Sequential(*blocks))
             self.widths.append(inside)
         super().__init__(*stem, *stages)
         for module in self.modules():
-            if isinstance(module, nn.Conv2d):
+            # A shape alone (the meta device) has nothing to draw, and asking for it would import a compiler.
+            if isinstance(module, nn.Conv2d) and not module.weight.is_meta:
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def stage_maps(self, images: torch.Tensor) -> list[torch.Tensor]:

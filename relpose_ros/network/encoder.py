@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional
@@ -17,6 +18,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from relpose_ros.network.presets import CorrelationSettings, Preset
+
+
+def octaves(count: int) -> torch.Tensor:
+    """The frequencies 1, 2, 4, ... (count,) int64."""
+    return torch.tensor([2**power for power in range(count)])
 
 
 def fourier(values: torch.Tensor, frequencies: torch.Tensor) -> torch.Tensor:
@@ -37,9 +43,9 @@ class IndexEncoding(nn.Module):
     @staticmethod
     def table(views: int, width: int) -> torch.Tensor:
         """(1, views, width): sines at even, cosines at odd columns, wavelengths up to 2 pi times 10000."""
-        column = torch.arange(width, dtype=torch.float64)
-        angles = torch.arange(views)[:, None] / 10000 ** (2 * (column // 2) / width)
-        return torch.where(column % 2 == 0, angles.sin(), angles.cos()).float()[None]
+        column = np.arange(width)
+        angles = np.arange(views)[:, None] / 10000 ** (2 * (column // 2) / width)
+        return torch.from_numpy(np.where(column % 2 == 0, np.sin(angles), np.cos(angles))).float()[None]
 
     def forward(self, tokens: torch.Tensor) -> torch.Tensor:
         """(..., N, D) -> the same, each token shifted by its row of the table."""

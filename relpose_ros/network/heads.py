@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -84,6 +85,7 @@ def _cosine_basis(side: int, count: int) -> torch.Tensor:
 
     Read through them, a match says where it is from the first step of training on.
     """
-    waves = torch.cos(math.pi / side * (torch.arange(side) + 0.5)[:, None] * torch.arange(side))
+    waves = np.cos(np.pi / side * (np.arange(side) + 0.5)[:, None] * np.arange(side))
     order = sorted((u + v, u, v) for u in range(side) for v in range(side))[1 : count + 1]
-    return torch.stack([(waves[:, u, None] * waves[:, v]).flatten() for _, u, v in order], -1)
+    basis = np.stack([(waves[:, u, None] * waves[:, v]).reshape(-1) for _, u, v in order], -1)
+    return torch.from_numpy(basis).float()

@@ -36,6 +36,8 @@ class Preset:
     """Whether a crop is low-pass filtered when it is shrunk."""
     stem_width: int = 64
     block: Literal["bottleneck", "basic"] = "bottleneck"
+    blurs: bool = True
+    """Whether the backbone halves its resolution by anti-aliasing blurs, or by strides alone."""
     stage_widths: tuple[int, ...] = (64, 128, 256, 512)
     stage_depths: tuple[int, ...] = (3, 4, 6, 3)
     layout_width: int | None = None
@@ -81,6 +83,7 @@ PRESETS = {
         crop_antialias=True,
         stem_width=32,
         block="basic",
+        blurs=False,
         stage_widths=(32, 64, 128, 256),
         stage_depths=(1, 2, 2, 1),
         layout_width=64,

@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from relpose_ros.errors import RelPoseError
 from relpose_ros.network import conventions
-from relpose_ros.network.encoder import Encoder, fourier
+from relpose_ros.network.encoder import Encoder, fourier, octaves
 from relpose_ros.network.features import SceneFeatures, ViewFeatures
 from relpose_ros.network.heads import CorrelationReader, Regressor
 
@@ -38,7 +38,7 @@ class RelPose(nn.Module):
     def __init__(self, preset: Preset) -> None:
         super().__init__()
         self.preset = preset
-        self.register_buffer("embedding", 2 ** torch.arange(preset.rotation_frequencies).reshape(1, 1, -1))
+        self.register_buffer("embedding", octaves(preset.rotation_frequencies)[None, None])
         self.feature_extractor = Encoder(preset)
         self.translation_regressor = Regressor(preset.token_width, preset.translation_widths, 3)
         if preset.rotation == "regression":
@@ -103,7 +103,7 @@ class RelPose(nn.Module):
             raise NetworkUseError(
                 f"This network takes at most {self.preset.max_views} views, it was given {views}."
             )
-        frequencies = 2 ** torch.arange(self.preset.crop_frequencies, device=pooled.device)
+        frequencies = octaves(self.preset.crop_frequencies).to(pooled.device)
         tokens = torch.cat([pooled, fourier(crop_parameters.to(pooled.dtype), frequencies)], -1)
         if not self.preset.pair_context:
             tokens = self.feature_extractor.relate(tokens)
