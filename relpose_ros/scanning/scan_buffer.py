@@ -33,7 +33,7 @@ class Decision:
 
     accepted: bool
     reason: str = ""
-    """Why not, as the end of a sentence; empty where it was accepted."""
+    """Why not, as the end of a sentence; empty where there is nothing to say."""
     rejected: bool = False
     """Whether something was wrong with it; neither accepted nor rejected is a view nobody needs."""
 
@@ -189,7 +189,7 @@ class ScanBuffer:
         self._backward_jump_ns = round(settings.backward_jump_s * 1e9)
         views, most = self._all(), settings.max_views
         surplus = {"first": views[most:], "latest": views[:-most], "spread": []}[settings.keep]
-        if len(self._views) != min(len(views), most):
+        if surplus or len(self._views) != min(len(views), most):
             self._forget(surplus)
 
     def _take(self, view: View, topic: str) -> Decision:
@@ -206,7 +206,7 @@ class ScanBuffer:
             if len(self._candidates) > self._settings.max_views:
                 self._candidates.popleft()
                 self.dropped += 1
-            return Decision(True)
+            return Decision(True, "the scan is full: the next estimate tells whether it is worth a place")
         if full:
             del self._views[0]
             self.dropped += 1

@@ -305,7 +305,8 @@ class Scanner:
                     self._scans[object_id] = self._scans.pop(object_id)
                     for topic in topics:
                         self._topics[topic].used += 1
-                    return Receipt(True, object_id, "")
+                    text = str(source.rejection(decision.reason)) if decision.reason else ""
+                    return Receipt(True, object_id, text)
         text = str(source.rejection(decision.reason))
         if decision.rejected:
             return self._rejected(source.topic, object_id, text)

@@ -194,8 +194,8 @@ def _like_default(value: Any, default: Any) -> Any:
 
 def _check(name: str, value: Any, default: Any, metadata: Mapping[str, Any]) -> None:
     if type(value) is not type(default):
-        text = f"{name} is {value!r}, a {type(value).__name__}: it must be a {type(default).__name__}."
-        raise SettingsError(text)
+        given, wanted = type(value).__name__, type(default).__name__
+        raise SettingsError(f"{name} is {value!r} of type {given}: it must be of type {wanted}.")
     choices = metadata["choices"]
     if choices is not None:
         for word in value if isinstance(value, tuple) else (value,):

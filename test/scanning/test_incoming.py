@@ -1,0 +1,339 @@
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from relpose_ros.scanning.incoming import (
+    Arrival,
+    Pairing,
+    Source,
+    ViewError,
+    object_id_of,
+    source_of,
+    view_from_image,
+    view_from_object_view,
+)
+from relpose_ros.views import BoundingBox, Intrinsics
+
+NAN = float("nan")
+
+
+def picture(width: int = 40, height: int = 32) -> np.ndarray:
+    return np.random.default_rng(3).integers(0, 256, (height, width, 3), np.uint8)
+
+
+def view_of(message: Any) -> Any:
+    return view_from_object_view(message, source_of(message, "views"))
+
+
+def view_of_pair(image: Any, info: Any) -> Any:
+    return view_from_image(image, info, source_of(image, "image"))
+
+
+def test_an_object_view_becomes_a_view(messages: Any) -> None:
+    pixels = picture()
+    mask = np.zeros((32, 40), np.uint8)
+    mask[10:20, 12:24] = 255
+    message = messages.object_view(
+        messages.rgb(pixels),
+        box=(10, 8, 20, 10),
+        mask=messages.image(mask.tobytes(), 40, 32, "mono8", 40),
+        k=(500, 0, 20.25, 0, 510, 15.75, 0, 0, 1),
+        stamp=12.5,
+        frame_id="left_optical",
+    )
+    view = view_of(message)
+    # The squared box is 20 wide about (20, 13); 1.2 of it are columns 8 to 32 and rows 1 to 25.
+    assert view.origin == (8, 1)
+    np.testing.assert_array_equal(view.image, pixels[1:25, 8:32])
+    np.testing.assert_array_equal(view.mask, mask[1:25, 8:32] > 0)
+    assert view.box == BoundingBox(10.0, 8.0, 30.0, 18.0)
+    assert (view.full_width, view.full_height) == (40, 32)
+    assert (view.stamp_ns, view.frame_id) == (12_500_000_000, "left_optical")
+    assert view.intrinsics == Intrinsics(500.0, 510.0, 20.75, 16.25), "half a pixel to the corner convention"
+
+
+def test_nobody_needs_to_send_a_mask_or_intrinsics(messages: Any) -> None:
+    view = view_of(messages.object_view())
+    assert view.mask is None
+    assert view.intrinsics is None
+
+
+def test_a_view_may_come_compressed(messages: Any) -> None:
+    data = cv2.imencode(".png", picture())[1].tobytes()
+    view = view_of(messages.object_view(compressed=messages.compressed(data, "png")))
+    np.testing.assert_array_equal(view.image, picture()[6:26, 6:26, ::-1])
+
+
+@pytest.mark.parametrize(
+    ("size", "crop", "origin"),
+    [
+        ((40, 32), (0, 0, 0, 0), (6, 6)),  # the whole image
+        ((40, 32), (0, 0, 40, 32), (6, 6)),  # the same, said
+        ((16, 16), (0, 0, 0, 0), (8, 8)),  # the box alone
+        ((16, 16), (8, 8, 16, 16), (8, 8)),
+        ((30, 20), (5, 7, 30, 20), (6, 7)),  # a crop with a margin of its own
+    ],
+)
+def test_the_crop_says_where_the_picture_belongs(
+    messages: Any, size: tuple[int, int], crop: tuple[int, ...], origin: tuple[int, int]
+) -> None:
+    """The box is columns and rows 8 to 24, the region kept 6 to 26."""
+    whole = picture()
+    x, y = crop[:2] if any(crop) else (0, 0) if size == (40, 32) else (8, 8)
+    message = messages.object_view(messages.rgb(whole[y : y + size[1], x : x + size[0]]), crop=crop)
+    view = view_of(message)
+    assert view.origin == origin
+    height, width = view.image.shape[:2]
+    np.testing.assert_array_equal(
+        view.image, whole[origin[1] : origin[1] + height, origin[0] : origin[0] + width]
+    )
+
+
+WRONG_OBJECT_VIEWS: list[tuple[dict[str, Any], str]] = [
+    ({"box": (8, 8, 0, 0)}, r"the box \[8, 8, 8, 8\] is too small: an object needs 8 x 8 pixels"),
+    ({"box": (8, 8, 7, 20)}, r"the box \[8, 8, 15, 28\] is too small"),
+    (
+        {"box": (30, 8, 16, 16)},
+        r"the box \[30, 8, 46, 24\] lies outside the full image of 40 x 32 pixels",
+    ),
+    ({"box": (2**32 - 1, 8, 2**32 - 1, 16)}, "lies outside the full image"),
+    ({"full": (0, 0), "crop": (0, 0, 40, 32)}, "the full image cannot have 0 x 0 pixels"),
+    ({"full": (2**32 - 1, 32), "crop": (0, 0, 40, 32)}, "the full image cannot have 4294967295 x 32 pixels"),
+    (
+        {"full": (80, 64)},
+        "the picture has 40 x 32 pixels: neither the full image's 80 x 64 nor the box's 16 x 16; fill crop",
+    ),
+    ({"crop": (0, 0, 20, 32)}, "crop has 20 x 32 pixels, the picture 40 x 32"),
+    ({"crop": (1, 0, 40, 32)}, r"the crop \[1, 0, 41, 32\] lies outside the full image"),
+    ({"crop": (3, 0, 0, 0)}, "crop has 0 x 0 pixels"),
+    (
+        {"crop": (30, 30, 40, 32), "full": (100, 100)},
+        r"the box \[8, 8, 24, 24\] lies outside the picture, which shows \[30, 30, 70, 62\]",
+    ),
+    ({"k": (NAN, 0, 20, 0, 500, 16, 0, 0, 1)}, r"the intrinsic matrix holds what is no number: \[nan, 0.0,"),
+    ({"k": (500, 0, 20, 0, 500, 16, 0, 0, float("inf"))}, "no number"),
+    ({"k": (500, 0, 20, 0, 0, 16, 0, 0, 1)}, "focal length in the intrinsic matrix is 500.0, 0.0"),
+    ({"k": (-500, 0, 20, 0, 500, 16, 0, 0, 1)}, "must be positive"),
+    ({"frame_id": "x" * 129}, r"frame_id has 129 characters, more than 128: 'x{40}'\.\.\."),
+    ({"frame_id": "a\x00b"}, r"frame_id 'a\\x00b' holds what cannot be printed"),
+]
+
+
+@pytest.mark.parametrize(("fields", "said"), WRONG_OBJECT_VIEWS)
+def test_a_wrong_object_view_is_rejected_with_topic_stamp_and_value(
+    messages: Any, fields: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ViewError, match=rf"^views, stamp 7\.000000009: .*{said}.*\.$"):
+        view_of(messages.object_view(stamp=(7, 9), **fields))
+
+
+def test_a_wrong_picture_is_rejected_with_topic_stamp_and_value(messages: Any) -> None:
+    cut_off = messages.image(bytes(100), 40, 32, "rgb8", 120)
+    jpeg = messages.compressed(b"\xff\xd8 no picture")
+    small = messages.image(bytes(100), 10, 10, "mono8", 10)
+    coloured = messages.rgb(picture())
+    for fields, said in [
+        ({"image": cut_off}, "the data are cut off: 100 bytes"),
+        ({"image": messages.image()}, "the picture has no pixels: 0 x 0"),
+        ({"compressed": jpeg}, "the JPEG's header is broken"),
+        ({"image": coloured, "compressed": jpeg}, "both image and compressed are filled"),
+        ({"mask": small}, "the mask has 10 x 10 pixels, the picture 40 x 32"),
+        ({"mask": coloured}, "the mask's encoding is 'rgb8'"),
+        (
+            {"mask": messages.image(bytes(99), 40, 32, "mono8", 40)},
+            "the mask: the data are cut off: 99 bytes",
+        ),
+    ]:
+        with pytest.raises(ViewError, match=rf"^views, stamp 7\.000000009: .*{said}.*\.$"):
+            view_of(messages.object_view(stamp=(7, 9), **fields))
+
+
+@pytest.mark.parametrize("stamp", [(-1, 0), (5, 1_000_000_000), (5, 2**32 - 1)])
+def test_a_stamp_that_is_no_time_is_rejected(messages: Any, stamp: tuple[int, int]) -> None:
+    with pytest.raises(
+        ViewError, match=f"views: the stamp is no time: sec is {stamp[0]}, nanosec is {stamp[1]}"
+    ):
+        source_of(messages.object_view(stamp=stamp), "views")
+
+
+def test_the_object_id_is_checked_and_has_a_default(messages: Any) -> None:
+    source = Source("views", 0, "")
+    assert object_id_of(messages.object_view(object_id="mug"), source, "object") == "mug"
+    assert object_id_of(messages.object_view(object_id=""), source, "object") == "object"
+    with pytest.raises(ViewError, match="object_id has 5000 characters, more than 128: 'x"):
+        object_id_of(messages.object_view(object_id="x" * 5000), source, "object")
+    with pytest.raises(ViewError, match="cannot be printed"):
+        object_id_of(messages.object_view(object_id="a\nb"), source, "object")
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize(
+    ("size", "roi", "box", "origin"),
+    [
+        ((40, 32), (0, 0, 0, 0), (0, 0, 40, 32), (0, 0)),
+        ((40, 32), (0, 0, 40, 32), (0, 0, 40, 32), (0, 0)),
+        ((40, 32), (10, 4, 20, 20), (10, 4, 30, 24), (8, 2)),
+        ((20, 20), (10, 4, 20, 20), (10, 4, 30, 24), (10, 4)),
+    ],
+)
+def test_the_roi_of_a_camera_info_is_the_box(
+    messages: Any,
+    size: tuple[int, int],
+    roi: tuple[int, int, int, int],
+    box: tuple[int, int, int, int],
+    origin: tuple[int, int],
+    compressed: bool,
+) -> None:
+    pixels = picture(*size)
+    if compressed:
+        data = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes()
+        image = messages.compressed(data, "png", stamp=2.0)
+    else:
+        image = messages.rgb(pixels, stamp=2.0)
+    view = view_of_pair(image, messages.camera_info(40, 32, roi, stamp=2.0))
+    assert view.box == BoundingBox(*map(float, box))
+    assert (view.full_width, view.full_height) == (40, 32)
+    assert view.origin == origin
+    assert view.intrinsics == Intrinsics(500.0, 500.0, 320.5, 240.5)
+    height, width = view.image.shape[:2]
+    x, y = (origin[0] - roi[0], origin[1] - roi[1]) if size != (40, 32) else origin
+    np.testing.assert_array_equal(view.image, pixels[y : y + height, x : x + width])
+
+
+def test_an_uncalibrated_camera_needs_no_size(messages: Any) -> None:
+    view = view_of_pair(messages.rgb(picture()), messages.camera_info(0, 0, k=(0,) * 9))
+    assert (view.full_width, view.full_height, view.intrinsics) == (40, 32, None)
+
+
+@pytest.mark.parametrize(
+    ("info", "said"),
+    [
+        (
+            {"width": 80, "height": 64},
+            "the picture has 40 x 32 pixels: neither the 80 x 64 of camera_info nor the 80 x 64 of its roi",
+        ),
+        ({"width": 80, "height": 64, "roi": (0, 0, 20, 20)}, "nor the 20 x 20 of its roi"),
+        ({"width": 0, "height": 0, "roi": (4, 4, 20, 20)}, "neither the 0 x 0 of camera_info"),
+        ({"width": 40, "height": 32, "roi": (4, 4, 0, 0)}, r"the box \[4, 4, 4, 4\] is too small"),
+        ({"width": 40, "height": 32, "roi": (30, 4, 20, 20)}, "lies outside the full image of 40 x 32"),
+        ({"width": 50, "height": 40, "roi": (30, 4, 40, 32)}, "lies outside the full image of 50 x 40"),
+        ({"width": 40, "height": 32, "binning": (2, 2)}, "binning is 2 x 2 in camera_info"),
+        ({"width": 40, "height": 32, "k": (NAN,) * 9}, "no number"),
+    ],
+)
+def test_a_wrong_camera_info_is_rejected(messages: Any, info: dict[str, Any], said: str) -> None:
+    with pytest.raises(ViewError, match=rf"^image, stamp 1\.000000000: .*{said}.*\.$"):
+        view_of_pair(messages.rgb(picture()), messages.camera_info(**info))
+
+
+def test_binning_by_one_is_none(messages: Any) -> None:
+    assert view_of_pair(messages.rgb(picture()), messages.camera_info(40, 32, binning=(1, 1))).box.width == 40
+
+
+@settings(max_examples=300)
+@given(
+    box=st.tuples(*(st.integers(0, 60),) * 2, *(st.integers(8, 60),) * 2),
+    full=st.tuples(st.integers(8, 64), st.integers(8, 64)),
+)
+def test_a_view_holds_the_network_crop_as_far_as_there_is_a_picture(
+    bag_messages: Any, box: tuple[int, int, int, int], full: tuple[int, int]
+) -> None:
+    """The network's crop is the squared box scaled by 1.15."""
+    pixels = picture(*full)
+    inside = box[0] + box[2] <= full[0] and box[1] + box[3] <= full[1]
+    message = bag_messages.object_view(bag_messages.rgb(pixels), box=box, full=full)
+    if not inside:
+        with pytest.raises(ViewError, match="outside the full image"):
+            view_of(message)
+        return
+    view = view_of(message)
+    half = 1.15 * max(box[2], box[3]) / 2
+    (x0, y0), (height, width) = view.origin, view.image.shape[:2]
+    x, y = box[0] + box[2] / 2, box[1] + box[3] / 2
+    assert x0 <= max(0, x - half)
+    assert y0 <= max(0, y - half)
+    assert x0 + width >= min(full[0], x + half)
+    assert y0 + height >= min(full[1], y + half)
+    np.testing.assert_array_equal(view.image, pixels[y0 : y0 + height, x0 : x0 + width])
+
+
+def arrival(stamp: int, what: str = "") -> Arrival:
+    return Arrival((what, stamp), Source("topic", stamp, ""))
+
+
+def pairs(pairing: Pairing, kind: Any, *stamps: int, camera: str = "") -> list[tuple[Any, Any]]:
+    found = [pair for stamp in stamps for pair in pairing.add(kind, arrival(stamp, kind), camera)]
+    return [(pair.image.message, pair.info.message) for pair in found]
+
+
+def test_images_and_infos_meet_whichever_comes_first() -> None:
+    pairing = Pairing(5, 1000)
+    assert pairs(pairing, "image", 1, 2) == []
+    assert pairs(pairing, "camera_info", 2) == [(("image", 2), ("camera_info", 2))]
+    assert pairs(pairing, "camera_info", 3) == []
+    assert pairs(pairing, "image", 3) == [(("image", 3), ("camera_info", 3))]
+    assert pairing.waiting() == 1
+
+
+def test_one_info_serves_the_raw_and_the_compressed_picture() -> None:
+    pairing = Pairing(5, 1000)
+    assert pairs(pairing, "image", 1) == []
+    assert len(pairs(pairing, "camera_info", 1)) == 1
+    assert len(pairs(pairing, "compressed", 1)) == 1
+    assert pairs(pairing, "image", 2) == pairs(pairing, "compressed", 2) == []
+    assert len(pairs(pairing, "camera_info", 2)) == 2
+
+
+def test_cameras_are_not_mixed() -> None:
+    pairing = Pairing(5, 1000)
+    assert pairs(pairing, "image", 1, camera="left") == []
+    assert pairs(pairing, "camera_info", 1, camera="right") == []
+    assert len(pairs(pairing, "camera_info", 1, camera="left")) == 1
+
+
+def test_what_waits_longest_goes_when_there_is_too_much() -> None:
+    pairing = Pairing(3, 1000)
+    pairs(pairing, "image", *range(10))
+    assert pairing.waiting() == 3
+    assert len(pairs(pairing, "camera_info", *range(10))) == 3
+    assert pairing.waiting() == 0
+
+
+def test_pairing_goes_on_after_time_jumped_back() -> None:
+    pairing = Pairing(30, 1000)
+    pairs(pairing, "image", *range(0, 20_000, 500))
+    assert pairing.waiting() == 30
+    # The bag starts again; only images before had lost their infos.
+    found = []
+    for stamp in range(0, 20_000, 500):
+        found += pairs(pairing, "image", stamp) + pairs(pairing, "camera_info", stamp)
+    assert [info[1] for _, info in found] == list(range(0, 20_000, 500))
+    assert pairing.waiting() == 0, "the images of the first round are forgotten"
+
+
+def test_a_garbage_stamp_costs_no_waiting_image() -> None:
+    pairing = Pairing(30, 1000)
+    pairs(pairing, "image", 5000, 5100, 0, 5200, 10**18, 5300, 5400)
+    assert len(pairs(pairing, "camera_info", 5000, 5100, 5200, 5300, 5400)) == 5
+
+
+@settings(max_examples=200)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["image", "compressed", "camera_info"]), st.integers(0, 12)), max_size=60
+    )
+)
+def test_pairs_always_have_one_stamp_and_memory_is_bounded(arrivals: list[tuple[Any, int]]) -> None:
+    pairing = Pairing(4, 3)
+    for kind, stamp in arrivals:
+        for pair in pairing.add(kind, arrival(stamp, kind), ""):
+            assert pair.image.source.stamp_ns == pair.info.source.stamp_ns == stamp
+            assert pair.info.message[0] == "camera_info"
+            assert pair.image.message[0] != "camera_info"
+        assert pairing.waiting() <= 8

@@ -1,0 +1,322 @@
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from relpose_ros.scanning.scan_buffer import (
+    Decision,
+    ScanBuffer,
+    most_redundant,
+    nearest_angles,
+)
+from relpose_ros.scanning.settings import ScanSettings
+from relpose_ros.views import BoundingBox, Scan, View
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SECOND = 1_000_000_000
+
+
+def view(stamp: float) -> View:
+    pixels = np.zeros((8, 8, 3), np.uint8)
+    return View(pixels, BoundingBox(0, 0, 8, 8), 8, 8, stamp_ns=round(stamp * SECOND))
+
+
+def buffer_with(*stamps: float, **fields: Any) -> ScanBuffer:
+    buffer = ScanBuffer("mug", ScanSettings(**fields))
+    for stamp in stamps:
+        assert buffer.add(view(stamp), "a").accepted
+    return buffer
+
+
+def stamps_of(buffer: ScanBuffer) -> list[float]:
+    return [each.stamp_ns / SECOND for each in buffer.views]
+
+
+def add(buffer: ScanBuffer, *stamps: float, topic: str = "a") -> list[Decision]:
+    return [buffer.add(view(stamp), topic) for stamp in stamps]
+
+
+def estimate_all(buffer: ScanBuffer, estimator: Any) -> list[bool]:
+    """Work until there is none; whether each result stood."""
+    stood = []
+    while (work := buffer.work()) is not None:
+        stood.append(buffer.settle(work, estimator.estimate(Scan("mug", work.views))))
+    return stood
+
+
+def test_first_keeps_the_earliest() -> None:
+    buffer = buffer_with(1, 2, 3, keep="first", max_views=3)
+    (decision,) = add(buffer, 4)
+    assert not decision.accepted
+    assert not decision.rejected
+    assert decision.reason == "the scan of 'mug' has its 3 views"
+    assert stamps_of(buffer) == [1, 2, 3]
+    assert buffer.dropped == 1
+
+
+def test_latest_keeps_the_newest() -> None:
+    buffer = buffer_with(*range(1, 51), keep="latest", max_views=3)
+    assert stamps_of(buffer) == [48, 49, 50]
+    assert buffer.dropped == 47
+
+
+def test_spread_puts_a_newcomer_from_elsewhere_in_the_place_of_the_most_redundant(
+    circle_estimator: Callable[..., Any],
+) -> None:
+    azimuths = {1: 0.0, 2: 30.0, 3: 33.0, 4: 90.0, 5: 150.0}
+    buffer = buffer_with(1, 2, 3, 4, keep="spread", max_views=4)
+    estimator = circle_estimator(lambda stamp: azimuths[round(stamp)])
+    assert estimate_all(buffer, estimator) == [True]
+    assert add(buffer, 5)[0].accepted
+    assert stamps_of(buffer) == [1, 2, 3, 4], "undecided until the estimate"
+    assert estimate_all(buffer, estimator) == [True]
+    # 2 and 3 are closest; 2 is closer to 1 than 3 is to 4.
+    assert stamps_of(buffer) == [1, 3, 4, 5]
+
+
+def test_spread_undoes_a_swap_that_gains_nothing(circle_estimator: Callable[..., Any]) -> None:
+    azimuths = {1: 0.0, 2: 30.0, 3: 90.0, 4: 91.0, 5: 31.5}
+    buffer = buffer_with(1, 2, 3, keep="spread", max_views=3)
+    estimator = circle_estimator(lambda stamp: azimuths[round(stamp)])
+    estimate_all(buffer, estimator)
+    add(buffer, 4)
+    assert estimate_all(buffer, estimator) == [False]
+    assert stamps_of(buffer) == [1, 2, 3]
+    assert not buffer.has_work()
+    (again,) = add(buffer, 4)
+    assert not again.accepted
+    assert not again.rejected, "the same picture by another transport"
+    assert buffer.dropped == 1
+
+
+def test_spread_never_gives_up_the_first_view(circle_estimator: Callable[..., Any]) -> None:
+    azimuths = {1: 0.0, 2: 1.0, 3: 90.0, 4: 180.0}
+    buffer = buffer_with(1, 2, 3, keep="spread", max_views=3)
+    estimator = circle_estimator(lambda stamp: azimuths[round(stamp)])
+    estimate_all(buffer, estimator)
+    add(buffer, 4)
+    estimate_all(buffer, estimator)
+    assert stamps_of(buffer) == [1, 3, 4]
+
+
+def test_an_orbit_ends_up_seen_from_all_around(circle_estimator: Callable[..., Any]) -> None:
+    """At 10 Hz the first eight views are nearly one: each later frame must be able to replace one of them."""
+    estimator = circle_estimator(lambda stamp: 36.0 * stamp)  # a turn in ten seconds
+    buffer = ScanBuffer("mug", ScanSettings(keep="spread"))
+    for tenth in range(100):
+        add(buffer, tenth / 10)
+        estimate_all(buffer, estimator)
+    directions = np.radians([36.0 * stamp for stamp in stamps_of(buffer)])
+    gaps = np.diff(np.append(directions, directions[0] + 2 * np.pi))
+    assert len(gaps) == 8
+    assert stamps_of(buffer)[0] == 0
+    assert np.degrees(gaps).min() > 20
+    assert np.degrees(gaps).max() < 90
+
+
+def test_a_still_camera_does_not_swap_views_for_noise(circle_estimator: Callable[..., Any]) -> None:
+    random = np.random.default_rng(0)
+    estimator = circle_estimator(lambda stamp: 0.1 * random.standard_normal())
+    buffer = ScanBuffer("mug", ScanSettings(keep="spread", max_views=3))
+    for stamp in range(30):
+        add(buffer, stamp)
+        estimate_all(buffer, estimator)
+    assert stamps_of(buffer) == [0, 1, 2]
+
+
+def test_spread_takes_newcomers_in_turn_and_lets_the_oldest_go(circle_estimator: Callable[..., Any]) -> None:
+    estimator = circle_estimator(lambda stamp: 3.0 * stamp)
+    buffer = buffer_with(*range(50), keep="spread", max_views=4)
+    assert stamps_of(buffer) == [0, 1, 2, 3]
+    assert buffer.dropped == 42, "four held, four in turn"
+    estimate_all(buffer, estimator)
+    assert stamps_of(buffer)[0] == 0
+    assert stamps_of(buffer)[-1] >= 46
+    assert buffer.dropped == 46
+
+
+@pytest.mark.parametrize("keep", ["first", "latest", "spread"])
+def test_a_late_view_is_rejected_and_a_repeated_one_declined(keep: str) -> None:
+    buffer = buffer_with(1.0, 1.5, keep=keep)
+    repeated, late, good = add(buffer, 1.0, 1.2, 1.6)
+    assert repeated == Decision(False, "a view with this stamp was seen already")
+    assert late.rejected
+    assert (
+        late.reason == "it is 0.300 s older than the scan of 'mug', whose newest view has stamp 1.500000000"
+    )
+    assert good.accepted
+    assert stamps_of(buffer) == [1.0, 1.5, 1.6]
+
+
+@pytest.mark.parametrize("garbage", [0.0, 2.0, 7.9])
+def test_a_lone_stamp_of_the_past_changes_nothing(garbage: float) -> None:
+    buffer = buffer_with(9, 10)
+    (lone, good) = add(buffer, garbage, 11)
+    assert lone.rejected
+    assert "rejected unless the next one confirms that time jumped backwards" in lone.reason
+    assert good.accepted
+    assert add(buffer, garbage + 0.1)[0].rejected, "the two are not one after the other"
+    assert stamps_of(buffer) == [9, 10, 11]
+
+
+@pytest.mark.parametrize("keep", ["first", "latest", "spread"])
+def test_a_lone_stamp_of_the_future_is_found_out(keep: str, caplog: pytest.LogCaptureFixture) -> None:
+    buffer = buffer_with(1, 2, 1e6, keep=keep, max_views=5)
+    first, second, third = add(buffer, 3, 4, 5)
+    assert first.rejected
+    assert second.accepted
+    assert third.accepted
+    assert stamps_of(buffer) == [1, 2, 3, 4, 5]
+    assert "stamp 1000000.000000000 is dropped: two later messages are older" in caplog.text
+
+
+@pytest.mark.parametrize("keep", ["first", "latest", "spread"])
+@pytest.mark.parametrize("count", [2, 3, 8, 20])
+def test_a_bag_that_loops_starts_the_scan_anew(
+    keep: str, count: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    buffer = ScanBuffer("mug", ScanSettings(keep=keep))
+    stamps = [10.0 + 2 * k for k in range(count)]
+    add(buffer, *stamps)
+    expected = stamps_of(buffer)
+    assert caplog.text == ""
+    add(buffer, *stamps)
+    assert stamps_of(buffer) == expected
+    if count > 2:  # with two, the second message repeats the newest view: nothing tells it from a late copy
+        assert f"Time jumped backwards from {buffer_text(stamps, keep)} to 10.000000000" in caplog.text
+        assert "the scan of 'mug' starts anew" in caplog.text
+
+
+def buffer_text(stamps: list[float], keep: str) -> str:
+    """The newest view held or waiting before the jump."""
+    newest = stamps[7] if keep == "first" and len(stamps) > 8 else stamps[-1]
+    return f"{newest:.9f}"
+
+
+def test_a_jump_resets_only_what_lies_before_it() -> None:
+    buffer = buffer_with(10, 11, 12)
+    assert [each.accepted for each in add(buffer, 1, 2, 3)] == [False, True, True]
+    assert stamps_of(buffer) == [1, 2, 3]
+
+
+def test_a_topic_that_lags_behind_another_is_no_jump() -> None:
+    buffer = buffer_with(1, 2, 3, 4, 5, 6)
+    lagging = add(buffer, 1, 2, 3, 4, topic="b")
+    assert not any(each.accepted or each.rejected for each in lagging)
+    assert stamps_of(buffer) == [1, 2, 3, 4, 5, 6]
+
+
+def test_dropping_the_last_view_has_the_others_estimated_again(circle_estimator: Callable[..., Any]) -> None:
+    buffer = buffer_with(1, 2, 3)
+    estimate_all(buffer, circle_estimator())
+    dropped = buffer.drop_last()
+    assert dropped is not None
+    assert dropped.stamp_ns == 3 * SECOND
+    assert buffer.has_work()
+    assert not add(buffer, 3)[0].accepted, "another transport must not bring it back"
+    assert add(buffer, 3.5)[0].accepted
+    assert stamps_of(buffer) == [1, 2, 3.5]
+    assert [buffer.drop_last() is None for _ in range(4)] == [False, False, False, True]
+    assert add(buffer, 0.5)[0].accepted, "an empty scan has no past"
+
+
+def test_an_estimate_of_views_forgotten_meanwhile_does_not_stand(
+    circle_estimator: Callable[..., Any],
+) -> None:
+    buffer = buffer_with(1, 2, 3)
+    work = buffer.work()
+    assert work is not None
+    buffer.drop_last()
+    assert not buffer.settle(work, circle_estimator().estimate(Scan("mug", work.views)))
+    assert buffer.has_work()
+
+
+def test_a_newcomer_on_trial_survives_when_another_view_is_dropped(
+    circle_estimator: Callable[..., Any],
+) -> None:
+    buffer = buffer_with(1, 2, 3, keep="spread", max_views=3)
+    estimate_all(buffer, circle_estimator())
+    add(buffer, 9, 10)
+    work = buffer.work()
+    assert work is not None
+    assert work.newcomer is not None
+    assert buffer.drop_last() is not None
+    assert not buffer.settle(work, circle_estimator().estimate(Scan("mug", work.views)))
+    estimate_all(buffer, circle_estimator())
+    assert 9 in stamps_of(buffer)
+    assert 10 not in stamps_of(buffer)
+
+
+def test_views_that_come_while_an_estimate_is_made_are_taken_together(
+    circle_estimator: Callable[..., Any],
+) -> None:
+    buffer = buffer_with(1, 2)
+    work = buffer.work()
+    assert work is not None
+    add(buffer, 3, 4, 5)
+    assert buffer.settle(work, circle_estimator().estimate(Scan("mug", work.views)))
+    following = buffer.work()
+    assert following is not None
+    assert [each.stamp_ns // SECOND for each in following.views] == [1, 2, 3, 4, 5]
+    assert buffer.work() is None
+
+
+def test_a_failed_estimate_is_tried_again_with_the_next_view() -> None:
+    buffer = buffer_with(1, 2, keep="spread", max_views=2)
+    work = buffer.work()
+    assert work is not None
+    buffer.give_up(work)
+    assert not buffer.has_work(), "the same views would fail again"
+    add(buffer, 3)
+    retried = buffer.work()
+    assert retried is not None
+    assert retried.views == work.views
+
+
+def test_other_settings_let_go_of_what_is_too_much() -> None:
+    for keep, left in (("first", [1, 2, 3]), ("latest", [3, 4, 5]), ("spread", [1, 2, 3])):
+        buffer = buffer_with(1, 2, 3, 4, 5, keep="latest")
+        buffer.change_settings(ScanSettings(keep=keep, max_views=3))
+        assert stamps_of(buffer) == left, keep
+    buffer.change_settings(ScanSettings(keep="spread", max_views=8))
+    assert stamps_of(buffer) == [1, 2, 3, 4, 5], "those that had no place are still there"
+
+
+def test_the_most_redundant_view_is_the_one_with_the_closest_neighbours() -> None:
+    def directions(*azimuths: float) -> np.ndarray:
+        angles = np.radians(azimuths)
+        return np.stack([np.sin(angles), 0 * angles, np.cos(angles)], -1)
+
+    assert most_redundant(directions(0, 40, 50, 120)) == 2 - 1
+    assert most_redundant(directions(0, 2, 90)) == 1
+    assert most_redundant(directions(0, 90)) == 1
+    np.testing.assert_allclose(np.degrees(nearest_angles(directions(0, 40, 50, 120))), [40, 10, 10, 70])
+
+
+@settings(max_examples=500)
+@given(
+    st.lists(st.tuples(st.sampled_from("ab"), st.floats(0, 20)), max_size=40),
+    st.sampled_from(["first", "latest", "spread"]),
+)
+def test_whatever_stamps_come_the_views_are_ordered_and_all_accounted_for(
+    arrivals: list[tuple[str, float]], keep: str
+) -> None:
+    logging.getLogger("relpose_ros").setLevel(logging.ERROR)
+    buffer = ScanBuffer("mug", ScanSettings(keep=keep, max_views=3))
+    for topic, stamp in arrivals:
+        before = buffer.views
+        decision = buffer.add(view(stamp), topic)
+        views = buffer.views
+        stamps = [each.stamp_ns for each in views]
+        assert stamps == sorted(set(stamps))
+        assert len(views) <= 3
+        if decision.rejected:
+            assert decision.reason
+            assert views == before, "a rejected view costs none that is held"
