@@ -252,7 +252,9 @@ class BagReader:
         return Path(self._stack.enter_context(TemporaryDirectory(prefix="relpose_ros-")))
 
     def _typestore(self, connections: Sequence[Connection]) -> Typestore:
-        definitions: Typesdict = {**_base_store().fielddefs}
+        """The types of some connections, by the bag's own definitions where it has them."""
+        definitions: Typesdict = {}
+        undefined: list[Connection] = []
         for connection in connections:
             text, name = connection.msgdef.data, connection.msgtype
             try:
@@ -260,15 +262,20 @@ class BagReader:
                     definitions.update(get_types_from_msg(text, name))
                 elif connection.msgdef.format == MessageDefinitionFormat.IDL:
                     definitions.update(_types_from_idl(text))
-                elif name not in definitions:
-                    text = (
-                        f"{self.path} does not say what a {name} is (topic {connection.topic}), and this "
-                        "package does not know it; record the bag as MCAP, which embeds the definitions."
-                    )
-                    raise BagError(text)
+                else:
+                    undefined.append(connection)
             except TypesysError as err:
                 text = f"{self.path} holds a definition of {name} that makes no sense: {err}."
                 raise BagError(text) from err
+        if undefined:
+            definitions = {**_base_store().fielddefs, **definitions}
+        for connection in undefined:
+            if connection.msgtype not in definitions:
+                text = (
+                    f"{self.path} does not say what a {connection.msgtype} is (topic {connection.topic}), "
+                    "and this package does not know it; record it as MCAP, which embeds the definitions."
+                )
+                raise BagError(text)
         typestore = get_typestore(Stores.EMPTY)
         typestore.register(definitions)
         return typestore

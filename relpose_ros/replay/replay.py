@@ -10,7 +10,7 @@ from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from tqdm import tqdm
@@ -21,7 +21,7 @@ from relpose_ros.geometry import so3
 from relpose_ros.replay.bags import POSE_STAMPED, BagReader, BagWriter, choose_inputs
 from relpose_ros.replay.comparison import TruePose
 from relpose_ros.replay.recording import Recording
-from relpose_ros.replay.report import write_report
+from relpose_ros.replay.report import Cells, write_report
 from relpose_ros.scanning.outgoing import estimate_message, markers, pose_array
 from relpose_ros.scanning.scanner import Scanner
 from relpose_ros.scanning.settings import ScanSettings
@@ -29,9 +29,10 @@ from relpose_ros.scanning.settings import ScanSettings
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from relpose_ros.estimates import CameraPose, Mode, PairRotation
+    from relpose_ros.estimates import CameraPose, FloatArray, Mode, PairRotation
     from relpose_ros.replay.recording import EstimateRecord, ViewRecord
     from relpose_ros.scanning.scanner import SupportsEstimate
+    from relpose_ros.views import Scan
 
 logger = logging.getLogger("relpose_ros")
 
@@ -44,6 +45,13 @@ GROUND_TRUTH_TOPIC = "ground_truth/pose"
 ESTIMATES_FOLDER, SCAN_FILE, REPORT_FILE = "estimates", "scan.json", "report.html"
 SHOWN_REASONS = 6
 """Kinds of rejected messages that are told apart at the end."""
+
+
+class ShowsDistributions(Protocol):
+    """What a report asks of an estimator that can give more than modes."""
+
+    def pair_masses(self, scan: Scan) -> Sequence[tuple[FloatArray, FloatArray]]:
+        """Of each pair, in the estimate's order: (L, 3, 3) rotations and the (L,) probability of each."""
 
 
 class ReplayError(RelPoseError):
@@ -119,7 +127,8 @@ def replay(
         raise ReplayError(_why_nothing(bag, scanner, rejected))
     with _written_whole(output) as folder:
         for name, recording in _folders(recordings).items():
-            _write(folder / name, recording, settings, truth, rejected, bag.name)
+            cells = _cells(estimator, recording)
+            _write(folder / name, recording, settings, truth, rejected, bag.name, cells)
     for name, recording in _folders(recordings).items():
         last = recording.estimates[-1].estimate
         logger.info(
@@ -136,6 +145,17 @@ def _learned_estimator(weights: Path | None, settings: ScanSettings) -> Supports
     if weights is None and settings.weights:
         weights = Path(settings.weights)
     return Estimator.from_weights(weights, settings.threads or None)
+
+
+def _cells(
+    estimator: SupportsEstimate | ShowsDistributions, recording: Recording
+) -> dict[tuple[int, int], Cells]:
+    """The distributions behind the last estimate, where the estimator shows them."""
+    if not hasattr(estimator, "pair_masses") or recording.newest_scan is None:
+        return {}
+    pairs = recording.estimates[-1].estimate.pairs
+    masses = estimator.pair_masses(recording.newest_scan)
+    return {(pair.i, pair.j): Cells(*each) for pair, each in zip(pairs, masses, strict=True)}
 
 
 def _ground_truth(reader: BagReader) -> dict[int, TruePose]:
@@ -197,11 +217,12 @@ def _write(
     truth: Mapping[int, TruePose],
     rejected: Sequence[tuple[str, int]],
     title: str,
+    cells: Mapping[tuple[int, int], Cells],
 ) -> None:
     folder.mkdir(exist_ok=True)
     _write_bag(folder / ESTIMATES_FOLDER, recording, settings.object_frame)
     (folder / SCAN_FILE).write_text(scan_json(recording), encoding="utf-8")
-    write_report(folder / REPORT_FILE, recording, truth, rejected, title)
+    write_report(folder / REPORT_FILE, recording, truth, rejected, title, cells)
 
 
 def _write_bag(path: Path, recording: Recording, object_frame: str) -> None:
