@@ -11,7 +11,7 @@ import csv
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -55,7 +55,8 @@ class Assets:
     """Shapes without a texture of their own."""
     panoramas: tuple[Path, ...]
     surfaces: tuple[Path, ...]
-    """Pictures of materials and patterns."""
+    """Photographed materials."""
+    patterns: tuple[Path, ...]
     only_textured: bool = field(default=False)
     """Whether meshes always keep their own texture (the held-out objects, which are measured on)."""
 
@@ -75,7 +76,8 @@ class Assets:
             picture = self.random_surface(rng)
         elif not self.only_textured:
             gain = np.exp(rng.normal(0, 0.12, 3) + rng.normal(0, 0.15))
-            picture = cv2.LUT(picture, np.clip(np.arange(256)[:, None] * gain, 0, 255).astype(np.uint8)[None])
+            table = np.clip(np.arange(256)[:, None] * gain, 0, 255).astype(np.uint8)
+            picture = np.asarray(cv2.LUT(picture, table[None]), np.uint8)
             if rng.random() < 0.2:
                 picture = np.ascontiguousarray(picture[..., rng.permutation(3)])
         symmetry = Symmetry(entry.symmetry, None, 1 if entry.symmetry is SymmetryKind.NONE else 0)
@@ -83,8 +85,9 @@ class Assets:
 
     def random_surface(self, rng: np.random.Generator) -> Image:
         """A photographed material, a pattern, or a procedural texture."""
-        if self.surfaces and rng.random() < 0.6:
-            picture = read_picture(self.surfaces[int(rng.integers(len(self.surfaces)))])
+        pictures = self.surfaces if rng.random() < 0.8 else self.patterns
+        if pictures and rng.random() < 0.65:
+            picture = read_picture(pictures[int(rng.integers(len(pictures)))])
             size = 256
             if min(picture.shape[:2]) > size and rng.random() < 0.5:
                 y, x = (int(rng.integers(0, n - size)) for n in picture.shape[:2])
@@ -95,7 +98,9 @@ class Assets:
 
 def _finish(rng: np.random.Generator) -> tuple[float, float]:
     """Gloss and relief of a mesh."""
-    return float(rng.uniform(0, 0.4) * rng.random()), float(rng.uniform(0, 0.015) * (rng.random() < 0.4))
+    return float(rng.uniform(0, 0.4) * (rng.random() < 0.5)), float(
+        rng.uniform(0, 0.015) * (rng.random() < 0.4)
+    )
 
 
 def load_assets(folder: Path, split: str = "train") -> Assets:
@@ -131,7 +136,8 @@ def load_assets(folder: Path, split: str = "train") -> Assets:
         groups=tuple(tuple(group) for group in groups.values()),
         bare=tuple(entry for entry in entries if not entry.textured),
         panoramas=tuple(folder / "backgrounds" / p["file"] for p in pictures if p["kind"].startswith("hdri")),
-        surfaces=tuple(folder / "backgrounds" / p["file"] for p in pictures if not p["kind"].startswith("hdri")),
+        surfaces=tuple(folder / "backgrounds" / p["file"] for p in pictures if p["kind"] == "surface"),
+        patterns=tuple(folder / "backgrounds" / p["file"] for p in pictures if p["kind"] == "pattern"),
         only_textured=split == "held_out",
     )
 
@@ -142,7 +148,9 @@ def _manifest(folder: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
     except OSError as err:
-        text = f"{path} cannot be read; an assets folder holds meshes/manifest.csv and backgrounds/manifest.csv."
+        text = (
+            f"{path} cannot be read; an assets folder holds meshes/manifest.csv and backgrounds/manifest.csv."
+        )
         raise AssetsError(text) from err
     missing = [column for column in columns if not rows or column not in rows[0]]
     if missing:
@@ -161,7 +169,7 @@ def read_mesh(path: Path) -> tuple[shapes.Mesh, Image | None]:
     import trimesh
 
     try:
-        loaded = trimesh.load(path, force="mesh", process=False)
+        loaded: Any = trimesh.load(path, force="mesh", process=False)
     except (OSError, ValueError, KeyError) as err:
         text = f"{path} cannot be read as a mesh: {err}."
         raise AssetsError(text) from err

@@ -7,7 +7,7 @@ a bounding sphere of radius 1, z up as it would stand. Meshes of an assets folde
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,12 +43,14 @@ class SyntheticObject:
     """What is scanned."""
 
     parts: tuple[Part, ...]
-    symmetry: Symmetry = Symmetry()
+    symmetry: Symmetry = field(default_factory=Symmetry)
     name: str = ""
 
     def transformed(self, matrix: np.ndarray, offset: np.ndarray | float = 0.0) -> SyntheticObject:
         """Apply ``x -> matrix x + offset``; the symmetry's axis turns with it."""
-        moved = tuple(replace(p, mesh=p.mesh.transformed(matrix, np.broadcast_to(offset, 3))) for p in self.parts)
+        moved = tuple(
+            replace(p, mesh=p.mesh.transformed(matrix, np.broadcast_to(offset, 3))) for p in self.parts
+        )
         symmetry = self.symmetry
         if symmetry.axis is not None:
             axis = matrix @ np.asarray(symmetry.axis)
@@ -65,7 +67,7 @@ class SyntheticObject:
 
 
 def random_object(rng: np.random.Generator, assets: Assets | None = None) -> SyntheticObject:
-    """Any kind of thing, as common as seems useful for learning; half of them meshes where there are assets."""
+    """Any kind of thing, as common as seems useful for learning; half of them meshes with assets."""
     if assets is not None and rng.random() < 0.5:
         thing = assets.random_object(rng)
     else:
@@ -83,7 +85,7 @@ def _material(rng: np.random.Generator, mesh: Mesh, texture: Image | None = None
     """A part with a random material; plain ones are less common than on real things, being hard."""
     if texture is None:
         texture = textures.surface(rng, contrast=0.05) if rng.random() < 0.15 else textures.surface(rng)
-    gloss = rng.uniform(0, 0.15) if rng.random() < 0.6 else rng.uniform(0.15, 0.8)
+    gloss = 0.0 if rng.random() < 0.55 else rng.uniform(0.05, 0.8)
     relief = 0.0 if rng.random() < 0.5 else rng.uniform(0, 0.02)
     return Part(mesh, texture, gloss=float(gloss), relief=float(relief))
 
@@ -119,7 +121,15 @@ def bottle(rng: np.random.Generator) -> SyntheticObject:
     neck = rng.uniform(0.25, 1.0)
     if rng.random() < 0.5:
         shoulder, end = rng.uniform(0.5, 0.9) * height, height
-        profile = [(0, 0), (0.93, 0), (1, 0.05), (1, shoulder), (neck, (shoulder + end) / 2), (neck, end), (0, end)]
+        profile = [
+            (0, 0),
+            (0.93, 0),
+            (1, 0.05),
+            (1, shoulder),
+            (neck, (shoulder + end) / 2),
+            (neck, end),
+            (0, end),
+        ]
     else:
         knots = np.linspace(0, height, 6)
         radius = np.concatenate([rng.uniform(0.4, 1.0, 5), [neck]])
@@ -135,7 +145,11 @@ def bottle(rng: np.random.Generator) -> SyntheticObject:
             Symmetry(SymmetryKind.CONTINUOUS, (0.0, 0.0, 1.0), 0),
             "lathe",
         )
-    parts = [_material(rng, body, textures.surface(rng) if rng.random() < 0.6 else _square(textures.label(rng, 128, 256)))]
+    parts = [
+        _material(
+            rng, body, textures.surface(rng) if rng.random() < 0.6 else _square(textures.label(rng, 128, 256))
+        )
+    ]
     low, high = np.sort(rng.uniform(0.1, 0.7, 2)) * height
     if high - low > 0.15 * height:
         wall = shapes.lathe([(1.012, low), (1.012, high)])
@@ -185,10 +199,22 @@ def mug(rng: np.random.Generator) -> SyntheticObject:
         ear = _handle(rng, float(np.interp(0.5, t, outside)), 0.2 * height, 0.85 * height)
         parts.append(replace(body, mesh=ear) if rng.random() < 0.6 else _material(rng, ear))
     if rng.random() < 0.3:
-        spout = [(-0.8, 0, 0.35 * height), (-1.3, 0, 0.5 * height), (-1.7, 0, rng.uniform(0.8, 1.05) * height)]
-        parts.append(replace(body, mesh=shapes.tube(shapes.smooth_path(spout, 12), np.linspace(0.25, 0.1, 12))))
+        spout = [
+            (-0.8, 0, 0.35 * height),
+            (-1.3, 0, 0.5 * height),
+            (-1.7, 0, rng.uniform(0.8, 1.05) * height),
+        ]
+        parts.append(
+            replace(body, mesh=shapes.tube(shapes.smooth_path(spout, 12), np.linspace(0.25, 0.1, 12)))
+        )
     if rng.random() < 0.3:
-        lid = [(flare * 0.98, height), (flare * 0.5, height * 1.12), (0.12, height * 1.2), (0.18, height * 1.3), (0, height * 1.33)]
+        lid = [
+            (flare * 0.98, height),
+            (flare * 0.5, height * 1.12),
+            (0.12, height * 1.2),
+            (0.18, height * 1.3),
+            (0, height * 1.33),
+        ]
         parts.append(_material(rng, shapes.lathe(lid)))
     return SyntheticObject(tuple(parts), name="mug")
 
@@ -196,7 +222,8 @@ def mug(rng: np.random.Generator) -> SyntheticObject:
 def statue(rng: np.random.Generator) -> SyntheticObject:
     """One material, much relief: busts, animals, stones, figures on a base."""
     texture = textures.coloured(
-        textures.pattern(12 * int(rng.integers(40)) + int(rng.integers(3))), textures.palette(rng, contrast=rng.uniform(0.1, 0.5))
+        textures.pattern(12 * int(rng.integers(40)) + int(rng.integers(3))),
+        textures.palette(rng, contrast=rng.uniform(0.1, 0.5)),
     )
     relief, gloss = float(rng.uniform(0, 0.03)), float(rng.uniform(0, 0.3))
     blobs = []
@@ -205,7 +232,12 @@ def statue(rng: np.random.Generator) -> SyntheticObject:
         body = shapes.superquadric(*rng.uniform(0.5, 1.4, 2), rings=24, sectors=36)
         body = shapes.displaced(body, rng, rng.uniform(0.03, 0.2), finest=rng.uniform(4, 14))
         size = rng.uniform(0.25, 1.0, 3) * (1.0 if k == 0 else 0.65)
-        blobs.append(body.transformed(so3.random_rotations(1, rng)[0] @ np.diag(size), rng.normal(0, reach, 3) * (0.5, 0.5, 1.0) * (k > 0)))
+        blobs.append(
+            body.transformed(
+                so3.random_rotations(1, rng)[0] @ np.diag(size),
+                rng.normal(0, reach, 3) * (0.5, 0.5, 1.0) * (k > 0),
+            )
+        )
     for _ in range(int(rng.integers(0, 5))):
         start = rng.normal(0, 0.4, 3)
         limb = shapes.smooth_path(start + np.cumsum(rng.normal(0, 0.4, (4, 3)), 0), 12)
@@ -221,15 +253,30 @@ def statue(rng: np.random.Generator) -> SyntheticObject:
 def tool(rng: np.random.Generator) -> SyntheticObject:
     """A long handle with a head: hammer, brush, torch, axe; lying down."""
     path = shapes.smooth_path(
-        [(0, 0, 0), (0.8, rng.normal(0, 0.1), rng.normal(0, 0.1)), (1.7, rng.normal(0, 0.15), 0), (2.4, 0, 0)], 20
+        [
+            (0, 0, 0),
+            (0.8, rng.normal(0, 0.1), rng.normal(0, 0.1)),
+            (1.7, rng.normal(0, 0.15), 0),
+            (2.4, 0, 0),
+        ],
+        20,
     )
     radii = np.interp(np.linspace(0, 1, 20), np.linspace(0, 1, 5), rng.uniform(0.1, 0.28, 5))
     parts = [_material(rng, shapes.tube(path, radii, sides=14, flattening=rng.uniform(0.5, 1.3)))]
     for _ in range(int(rng.integers(1, 4))):
-        parts.append(_material(rng, _primitive(rng).scaled(rng.uniform(0.15, 0.6, 3)).moved((2.4 + rng.normal(0, 0.25), *rng.normal(0, 0.12, 2)))))
+        parts.append(
+            _material(
+                rng,
+                _primitive(rng)
+                .scaled(rng.uniform(0.15, 0.6, 3))
+                .moved((2.4 + rng.normal(0, 0.25), *rng.normal(0, 0.12, 2))),
+            )
+        )
     if rng.random() < 0.5:
         place = rng.uniform(0.3, 1.8)
-        ring = shapes.lathe([(0.3, -0.1), (0.32, 0), (0.3, 0.1)], sectors=20).transformed(np.eye(3)[[2, 0, 1]], (place, 0, 0))
+        ring = shapes.lathe([(0.3, -0.1), (0.32, 0), (0.3, 0.1)], sectors=20).transformed(
+            np.eye(3)[[2, 0, 1]], (place, 0, 0)
+        )
         parts.append(_material(rng, ring))
     return SyntheticObject(tuple(parts), name="tool")
 
@@ -240,7 +287,9 @@ def toy(rng: np.random.Generator) -> SyntheticObject:
     body = shapes.superquadric(*rng.uniform(0.15, 0.9, 2)) if rng.random() < 0.6 else shapes.box((2, 2, 2))
     parts = [_material(rng, body.scaled((length / 2, width / 2, height / 2)))]
     top = shapes.superquadric(*rng.uniform(0.2, 1, 2)).scaled(rng.uniform(0.25, 0.6, 3))
-    parts.append(_material(rng, top.moved((rng.uniform(-0.4, 0.5) * length, 0, height / 2 + rng.uniform(0, 0.3)))))
+    parts.append(
+        _material(rng, top.moved((rng.uniform(-0.4, 0.5) * length, 0, height / 2 + rng.uniform(0, 0.3))))
+    )
     wheel = _material(rng, shapes.lathe([(0, -0.1), (0.3, -0.1), (0.3, 0.1), (0, 0.1)], sectors=20))
     leg = _material(rng, shapes.lathe([(0, -0.5), (0.14, -0.5), (0.12, 0.5), (0, 0.5)], sectors=12))
     rolling = rng.random() < 0.6
@@ -260,7 +309,9 @@ def furniture(rng: np.random.Generator) -> SyntheticObject:
     wood = _material(rng, shapes.box())
     other = _material(rng, shapes.box())
     width, depth, seat = rng.uniform(0.7, 1.6), rng.uniform(0.7, 1.3), rng.uniform(0.4, 1.2)
-    bars: list[Part] = [replace(other, mesh=shapes.box((width, depth, rng.uniform(0.06, 0.25))).moved((0, 0, seat)))]
+    bars: list[Part] = [
+        replace(other, mesh=shapes.box((width, depth, rng.uniform(0.06, 0.25))).moved((0, 0, seat)))
+    ]
     thick = rng.uniform(0.05, 0.14)
     for x in (-1, 1):
         for y in (-1, 1):
@@ -270,9 +321,15 @@ def furniture(rng: np.random.Generator) -> SyntheticObject:
         back = shapes.box((width, 0.08, rng.uniform(0.4, 1.1))).moved((0, depth * 0.47, seat + 0.6))
         bars.append(replace(other if rng.random() < 0.6 else wood, mesh=back))
     if rng.random() < 0.5:
-        bars.append(_material(rng, shapes.box((width * 0.9, depth * 0.9, 0.06)).moved((0, 0, seat * rng.uniform(0.3, 0.7)))))
+        bars.append(
+            _material(
+                rng, shapes.box((width * 0.9, depth * 0.9, 0.06)).moved((0, 0, seat * rng.uniform(0.3, 0.7)))
+            )
+        )
     for _ in range(int(rng.integers(0, 4))):
-        mesh = _primitive(rng).scaled(rng.uniform(0.1, 0.3, 3)).moved((*rng.uniform(-0.3, 0.3, 2), seat + 0.25))
+        mesh = (
+            _primitive(rng).scaled(rng.uniform(0.1, 0.3, 3)).moved((*rng.uniform(-0.3, 0.3, 2), seat + 0.25))
+        )
         bars.append(_material(rng, mesh))
     return SyntheticObject(tuple(bars), name="furniture")
 
@@ -290,7 +347,9 @@ def _primitive(rng: np.random.Generator) -> Mesh:
         corners = int(rng.integers(3, 9))
         angle = np.arange(corners * 2) * np.pi / corners
         radius = np.where(np.arange(corners * 2) % 2 == 0, 1.0, rng.uniform(0.4, 1.0))
-        return shapes.prism(np.column_stack([np.cos(angle), np.sin(angle)]) * radius[:, None], 2.0, taper=rng.uniform(0.3, 1))
+        return shapes.prism(
+            np.column_stack([np.cos(angle), np.sin(angle)]) * radius[:, None], 2.0, taper=rng.uniform(0.3, 1)
+        )
     if kind == 4:
         angle = np.linspace(0, rng.uniform(0.7, 2.0) * np.pi, 24)
         ring = np.column_stack([np.cos(angle), np.sin(angle), rng.uniform(0, 0.15) * angle])
@@ -305,13 +364,21 @@ def heap(rng: np.random.Generator) -> SyntheticObject:
     for k in range(int(rng.integers(2, 8))):
         size = rng.uniform(0.15, 0.6, 3) * (1.4 if k == 0 else 0.8)
         turn = so3.random_rotations(1, rng)[0] if rng.random() < 0.5 else np.eye(3)
-        parts.append(_material(rng, _primitive(rng).transformed(turn @ np.diag(size), rng.normal(0, spread, 3) * (k > 0))))
+        parts.append(
+            _material(
+                rng, _primitive(rng).transformed(turn @ np.diag(size), rng.normal(0, spread, 3) * (k > 0))
+            )
+        )
     return SyntheticObject(tuple(parts), name="heap")
 
 
 def solid(rng: np.random.Generator) -> SyntheticObject:
     """One primitive under one strong texture."""
-    part = _material(rng, _primitive(rng).scaled(rng.uniform(0.4, 1, 3)), textures.surface(rng, contrast=rng.uniform(0.4, 1)))
+    part = _material(
+        rng,
+        _primitive(rng).scaled(rng.uniform(0.4, 1, 3)),
+        textures.surface(rng, contrast=rng.uniform(0.4, 1)),
+    )
     return SyntheticObject((part,), name="solid")
 
 

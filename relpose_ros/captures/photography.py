@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -51,7 +51,9 @@ def random_camera(rng: np.random.Generator) -> Camera:
     )
 
 
-def develop(picture: Image, camera: Camera, rng: np.random.Generator, within: npt.NDArray[np.bool_] | None = None) -> Image:
+def develop(
+    picture: Image, camera: Camera, rng: np.random.Generator, within: npt.NDArray[np.bool_] | None = None
+) -> Image:
     """One photograph by ``camera``: (H, W, 3) RGB in and out.
 
     Args:
@@ -64,12 +66,14 @@ def develop(picture: Image, camera: Camera, rng: np.random.Generator, within: np
     brightness = max(float(seen.mean()) / 255, 0.02) if seen.size else 0.5
     exposure = (camera.target / brightness) ** camera.control * float(np.exp(rng.normal(0, 0.06)))
     exposure = float(np.clip(exposure, 0.4, 3.0))
-    levels = np.arange(256)[:, None] / 255 * exposure * np.asarray(camera.balance) * (1 + rng.normal(0, 0.01, 3))
+    levels = (
+        np.arange(256)[:, None] / 255 * exposure * np.asarray(camera.balance) * (1 + rng.normal(0, 0.01, 3))
+    )
     # A shoulder instead of a cut keeps highlights from turning flat.
     levels = np.where(levels > 0.8, 0.8 + 0.2 * np.tanh((levels - 0.8) / 0.2), levels)
     levels = 0.5 + (levels - 0.5) * camera.contrast
     table = np.clip(levels * 255, 0, 255).astype(np.uint8)
-    result = cv2.LUT(picture, table[None])
+    result: Any = cv2.LUT(picture, table[None])
     if abs(camera.saturation - 1) > 0.02:
         grey = cv2.cvtColor(cv2.cvtColor(result, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
         result = cv2.addWeighted(result, camera.saturation, grey, 1 - camera.saturation, 0)
@@ -83,8 +87,16 @@ def develop(picture: Image, camera: Camera, rng: np.random.Generator, within: np
     if camera.grain > 0:
         # Cut from one long strip: drawing normal numbers anew costs more than all the rest.
         height, width = result.shape[:2]
-        start = int(rng.integers(0, len(_GRAIN) - height * width * 3)) if height * width * 3 < len(_GRAIN) else None
-        grain = _GRAIN[start : start + height * width * 3] if start is not None else rng.normal(0, 1, height * width * 3)
+        start = (
+            int(rng.integers(0, len(_GRAIN) - height * width * 3))
+            if height * width * 3 < len(_GRAIN)
+            else None
+        )
+        grain = (
+            _GRAIN[start : start + height * width * 3]
+            if start is not None
+            else rng.normal(0, 1, height * width * 3)
+        )
         noisy = result + camera.grain * np.asarray(grain, np.float32).reshape(result.shape)
         result = np.clip(noisy, 0, 255).astype(np.uint8)
     if camera.jpeg_quality < 100:

@@ -15,7 +15,7 @@ import numpy as np
 from relpose_ros.errors import RelPoseError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     import moderngl
     import numpy.typing as npt
@@ -32,6 +32,11 @@ _SHADOW_REACH = 2.2
 _CONTACT_SIZE = 64
 _CONTACT_REACH = 1.7
 _VERTEX_FLOATS = 11
+_MIRROR_SIZE = 64
+_UNITS = ("surfaces", "panorama", "mirrored", "shadow_map", "contact")
+"""Texture units, in order."""
+_GLOSSY = 0.02
+"""Below it a part reflects nothing worth drawing."""
 
 _SURFACE_VERTEX = """
 #version 330
@@ -55,11 +60,13 @@ void main() {
 """
 
 # Colours are squared on the way in and rooted on the way out: near enough to the sRGB curve.
+# What a part does not need is compiled out: software OpenGL runs both sides of every branch.
 _SURFACE_FRAGMENT = """
 #version 330
+#define FEATURES
 const float PI = 3.14159265;
 uniform sampler2DArray surfaces;
-uniform sampler2D panorama;
+uniform sampler2D mirrored;
 uniform sampler2DShadow shadow_map;
 uniform sampler2D contact;
 uniform mat4 shadow_from_world;
@@ -67,68 +74,70 @@ uniform mat3 object_from_world;
 uniform vec3 camera;
 uniform vec3 to_light;
 uniform vec3 key;
-uniform float ambient;
+uniform vec3 ambient[9];
 uniform float shadow;
 uniform float ground_z;
-uniform float is_object;
 uniform float sharpness;
-uniform float panorama_levels;
 in vec3 world;
 in vec3 turned;
 in vec3 texel;
 in vec2 finish;
 out vec4 colour;
 
+vec3 light_onto(vec3 n) {
+    return ambient[0] + ambient[1] * n.y + ambient[2] * n.z + ambient[3] * n.x
+        + ambient[4] * (n.x * n.y) + ambient[5] * (n.y * n.z) + ambient[6] * (3.0 * n.z * n.z - 1.0)
+        + ambient[7] * (n.x * n.z) + ambient[8] * (n.x * n.x - n.y * n.y);
+}
+
 vec3 light_from(vec3 direction, float level) {
-    vec2 place = vec2(atan(direction.y, direction.x) / (2.0 * PI) + 0.5, acos(clamp(direction.z, -1.0, 1.0)) / PI);
-    vec3 seen = textureLod(panorama, place, level).rgb;
+    vec3 d = direction / (abs(direction.x) + abs(direction.y) + abs(direction.z));
+    vec2 folded = (1.0 - abs(d.yx)) * vec2(d.x < 0.0 ? -1.0 : 1.0, d.y < 0.0 ? -1.0 : 1.0);
+    vec3 seen = textureLod(mirrored, (d.z < 0.0 ? folded : d.xy) * 0.5 + 0.5, level).rgb;
     return seen * seen;
 }
 
 void main() {
     vec3 base = texture(surfaces, texel, sharpness).rgb;
-    vec3 albedo = base * base;
     vec3 n = normalize(turned);
     vec3 eye = normalize(camera - world);
-    if (dot(n, eye) < 0.0) n = -n;
-    if (finish.y > 0.0) {
-        float height = dot(base, vec3(0.33)) * finish.y;
-        vec3 px = dFdx(world), py = dFdy(world);
-        vec3 across = cross(py, n), down = cross(n, px);
-        float area = dot(px, across);
-        n = normalize(abs(area) * n - sign(area) * (dFdx(height) * across + dFdy(height) * down) + n * 1e-9);
-    }
+    n = dot(n, eye) < 0.0 ? -n : n;
+#ifdef RELIEF
+    float height = (base.r + base.g + base.b) * 0.333 * finish.y;
+    vec3 px = dFdx(world), py = dFdy(world);
+    vec3 across = cross(py, n), down = cross(n, px);
+    float area = dot(px, across);
+    n = normalize((abs(area) + 1e-9) * n - sign(area) * (dFdx(height) * across + dFdy(height) * down));
+#endif
     float lit = max(dot(n, to_light), 0.0);
-    if (shadow > 0.0) {
-        vec3 place = (shadow_from_world * vec4(world + n * 0.02, 1.0)).xyz;
-        float open = 0.0;
-        for (int k = 0; k < 4; k++) {
-            vec2 shift = vec2(k & 1, k >> 1) * 0.008 - 0.004;
-            open += texture(shadow_map, vec3(place.xy + shift, place.z));
-        }
-        lit *= 1.0 - shadow * (1.0 - 0.25 * open);
-    }
-    vec3 diffuse = ambient * light_from(n, panorama_levels - 3.0);
-    float above = world.z - ground_z;
-    if (is_object < 0.5) {
-        vec3 local = object_from_world * world;
-        vec2 place = local.xy / (2.0 * CONTACT_REACH) + 0.5;
-        float dark = texture(contact, place).r * exp(-max(above, 0.0) * 6.0);
-        diffuse *= 1.0 - 0.85 * dark;
-        lit *= 1.0 - 0.5 * dark;
-    } else {
-        // What is near the ground and faces it sees less of the room.
-        diffuse *= 1.0 - 0.45 * exp(-max(above, 0.0) * 5.0) * (0.6 - 0.4 * n.z);
-    }
-    vec3 result = albedo * (key * lit + diffuse);
-    if (finish.x > 0.02) {
-        vec3 half_way = normalize(to_light + eye);
-        float focus = exp2(3.0 + 6.0 * finish.x);
-        float edge = 0.04 + 0.96 * pow(1.0 - max(dot(n, eye), 0.0), 5.0);
-        result += key * lit * finish.x * pow(max(dot(n, half_way), 0.0), focus) * 0.8;
-        result += finish.x * (0.08 + edge) * light_from(reflect(-eye, n), (1.0 - finish.x) * (panorama_levels - 3.0));
-    }
-    colour = vec4(sqrt(result / (1.0 + 0.25 * dot(result, vec3(0.33)))), is_object);
+#ifdef SHADOW
+    lit *= 1.0 - shadow * (1.0 - texture(shadow_map, (shadow_from_world * vec4(world + n * 0.02, 1.0)).xyz));
+#endif
+    vec3 diffuse = light_onto(n);
+    float above = max(world.z - ground_z, 0.0);
+#ifdef OBJECT
+    // What is near the ground and faces it sees less of the room.
+    diffuse *= 1.0 - 0.45 * exp2(-7.0 * above) * (0.6 - 0.4 * n.z);
+#else
+    vec2 beneath = (object_from_world * world).xy / (2.0 * CONTACT_REACH) + 0.5;
+    float dark = texture(contact, beneath).r * exp2(-8.0 * above);
+    diffuse *= 1.0 - 0.85 * dark;
+    lit *= 1.0 - 0.5 * dark;
+#endif
+    vec3 result = base * base * (key * lit + max(diffuse, 0.0));
+#ifdef GLOSS
+    float facing = max(dot(n, eye), 0.0), away = 1.0 - facing;
+    float edge = 0.04 + 0.96 * away * away * away * away * away;
+    float spot = exp2((dot(n, normalize(to_light + eye)) - 1.0) * 1.44 * exp2(3.0 + 6.0 * finish.x));
+    result += key * lit * finish.x * spot * 0.8;
+    result += finish.x * (0.08 + edge) * light_from(reflect(-eye, n), (1.0 - finish.x) * 4.0);
+#endif
+#ifdef OBJECT
+    const float coverage = 1.0;
+#else
+    const float coverage = 0.0;
+#endif
+    colour = vec4(sqrt(result / (1.0 + 0.25 * dot(result, vec3(0.33)))), coverage);
 }
 """.replace("CONTACT_REACH", str(_CONTACT_REACH))
 
@@ -151,7 +160,6 @@ uniform vec3 camera;
 uniform vec3 room_half;
 uniform vec3 eye;
 uniform float level;
-uniform float brightness;
 in vec3 ray;
 out vec4 colour;
 void main() {
@@ -159,7 +167,7 @@ void main() {
     vec3 walls = (sign(way) * room_half - camera) / way;
     vec3 hit = normalize(camera + min(walls.x, min(walls.y, walls.z)) * way - eye);
     vec2 place = vec2(atan(hit.y, hit.x) / (2.0 * PI) + 0.5, acos(clamp(hit.z, -1.0, 1.0)) / PI);
-    colour = vec4(textureLod(panorama, place, level).rgb * brightness, 0.0);
+    colour = vec4(textureLod(panorama, place, level).rgb, 0.0);
 }
 """
 
@@ -213,7 +221,7 @@ class Renderer:
         import moderngl
 
         try:
-            self._gl = moderngl.create_context(require=330, standalone=True, backend="egl")
+            self._gl = moderngl.create_context(require=330, standalone=True, backend="egl")  # type: ignore[arg-type]
         except Exception as err:  # glcontext raises bare Exception and ValueError alike
             text = (
                 f"no OpenGL 3.3 through EGL here ({err}). On Debian and Ubuntu: apt-get install libegl1 "
@@ -221,13 +229,11 @@ class Renderer:
             )
             raise RenderError(text) from err
         gl = self._gl
-        self._surface = gl.program(_SURFACE_VERTEX, _SURFACE_FRAGMENT)
+        self._surfaces: dict[tuple[str, ...], moderngl.Program] = {}
         self._backdrop = gl.program(_BACKDROP_VERTEX, _BACKDROP_FRAGMENT)
         self._place = gl.program(_PLAIN_VERTEX, _PLACE_FRAGMENT)
         self._depth = gl.program(_PLAIN_VERTEX, _EMPTY_FRAGMENT)
-        for unit, name in enumerate(("surfaces", "panorama", "shadow_map", "contact")):
-            _set(self._surface, name, unit)
-        _set(self._backdrop, "panorama", 1)
+        _set(self._backdrop, "panorama", _UNITS.index("panorama"))
         quad = np.array([[-1, -1], [3, -1], [-1, 3]], np.float32)
         self._everywhere = gl.vertex_array(self._backdrop, [(gl.buffer(quad.tobytes()), "2f", "corner")])
         self._shadow_map = gl.depth_texture((_SHADOW_SIZE, _SHADOW_SIZE))
@@ -247,7 +253,7 @@ class Renderer:
         windows: Sequence[Window],
         size: tuple[int, int],
         *,
-        supersampling: int = 2,
+        supersampling: float = 2.0,
         sharpness: float = 0.0,
     ) -> npt.NDArray[np.uint8]:
         """Draw one window of each shot.
@@ -262,11 +268,9 @@ class Renderer:
         Returns:
             (N, height, width, 4): RGB, and the object's coverage of the pixel, 0 to 255.
         """
-        with _Uploaded(self._gl, scene, self._surface, self._depth, self._place) as loaded:
-            drawn = self._colours(scene, loaded, windows, (size[0] * supersampling, size[1] * supersampling), sharpness)
-        if supersampling == 1:
-            return drawn
-        return np.stack([cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in drawn])
+        with self._uploaded(scene) as loaded:
+            drawn = self._colours(scene, loaded, windows, _enlarged(size, supersampling), sharpness)
+        return _shrunk(drawn, size)
 
     def draw_with_places(
         self,
@@ -275,7 +279,7 @@ class Renderer:
         size: tuple[int, int],
         stride: int,
         *,
-        supersampling: int = 2,
+        supersampling: float = 2.0,
         sharpness: float = 0.0,
     ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float16]]:
         """As ``draw``, and where on the object each ``stride``-th pixel looks.
@@ -284,40 +288,61 @@ class Renderer:
             The pictures, and (N, height // stride, width // stride, 3) object coordinates at the
             centres of cells of ``stride`` pixels, NaN off the object.
         """
-        with _Uploaded(self._gl, scene, self._surface, self._depth, self._place) as loaded:
-            drawn = self._colours(scene, loaded, windows, (size[0] * supersampling, size[1] * supersampling), sharpness)
+        with self._uploaded(scene) as loaded:
+            drawn = self._colours(scene, loaded, windows, _enlarged(size, supersampling), sharpness)
             places = self._places(scene, loaded, windows, (size[0] // stride, size[1] // stride))
-        if supersampling > 1:
-            drawn = np.stack([cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in drawn])
-        return drawn, places
+        return _shrunk(drawn, size), places
+
+    def _uploaded(self, scene: Scene) -> _Uploaded:
+        return _Uploaded(self._gl, scene, self._surface, self._depth, self._place)
+
+    def _surface(self, features: tuple[str, ...]) -> moderngl.Program:
+        """The shader of parts with these features, compiled at first use."""
+        if features not in self._surfaces:
+            defines = "\n".join(f"#define {name}" for name in features)
+            program = self._gl.program(
+                _SURFACE_VERTEX, _SURFACE_FRAGMENT.replace("#define FEATURES", defines)
+            )
+            for unit, name in enumerate(_UNITS):
+                _set(program, name, unit)
+            self._surfaces[features] = program
+        return self._surfaces[features]
 
     def _colours(
-        self, scene: Scene, loaded: _Uploaded, windows: Sequence[Window], size: tuple[int, int], sharpness: float
+        self,
+        scene: Scene,
+        loaded: _Uploaded,
+        windows: Sequence[Window],
+        size: tuple[int, int],
+        sharpness: float,
     ) -> npt.NDArray[np.uint8]:
-        gl, around, program = self._gl, scene.surroundings, self._surface
+        gl, around = self._gl, scene.surroundings
         columns, frame = self._atlas(len(scene.shots), size, "f1")
-        levels = np.log2(around.panorama.shape[1])
-        loaded.textures.use(0)
-        loaded.panorama.use(1)
-        self._shadow_map.use(2)
-        loaded.contact.use(3)
-        _set(program, "to_light", tuple(around.to_light))
-        _set(program, "key", tuple(around.key))
-        _set(program, "ambient", around.ambient)
-        _set(program, "shadow", around.shadow)
-        _set(program, "ground_z", -1e3 if around.ground_z is None else around.ground_z)
-        _set(program, "sharpness", sharpness)
-        _set(program, "panorama_levels", float(levels))
+        loaded.textures.use(_UNITS.index("surfaces"))
+        loaded.panorama.use(_UNITS.index("panorama"))
+        loaded.mirrored.use(_UNITS.index("mirrored"))
+        self._shadow_map.use(_UNITS.index("shadow_map"))
+        loaded.contact.use(_UNITS.index("contact"))
+        ambient = np.ascontiguousarray(loaded.ambient * around.ambient, np.float32).tobytes()
+        programs = {batch.program for batch in loaded.batches}
+        for program in programs:
+            _set(program, "to_light", tuple(around.to_light))
+            _set(program, "key", tuple(around.key))
+            _set(program, "shadow", around.shadow)
+            _set(program, "ground_z", around.ground_z)
+            _set(program, "sharpness", sharpness)
+            _send(program, "ambient", ambient)
         _set(self._backdrop, "room_half", tuple(around.room_half))
         _set(self._backdrop, "eye", tuple(around.eye))
-        _set(self._backdrop, "brightness", 1.0)
         frame.use()
         frame.clear()
         shadowed: FloatArray | None = None
         for k, (shot, window) in enumerate(zip(scene.shots, windows, strict=True)):
             turned = shot.world_from_object
             if around.shadow > 0 and (shadowed is None or not np.array_equal(turned, shadowed)):
-                self._cast_shadow(loaded, turned, around.to_light)
+                shadow_from_world = self._cast_shadow(loaded, turned, around.to_light)
+                for program in programs:
+                    _write(program, "shadow_from_world", shadow_from_world)
                 shadowed = turned
                 frame.use()
             corner = (k % columns * size[0], k // columns * size[1])
@@ -325,34 +350,39 @@ class Renderer:
             gl.scissor = _inside(shot, window, size, corner)
             camera_from_world = shot.camera_from_world
             centre = -camera_from_world[:, :3].T @ camera_from_world[:, 3]
-            clip = _clip_from_camera(shot, window)
-            _write(program, "clip_from_world", clip @ _homogeneous(camera_from_world))
-            _write(program, "object_from_world", turned.T)
-            _set(program, "camera", tuple(centre))
+            clip_from_world = _clip_from_camera(shot, window) @ _homogeneous(camera_from_world)
+            for program in programs:
+                _write(program, "clip_from_world", clip_from_world)
+                _write(program, "object_from_world", turned.T)
+                _set(program, "camera", tuple(centre))
             gl.enable(gl.DEPTH_TEST)
             gl.depth_func = "<"
-            for part, local in ((loaded.thing, turned), (loaded.turning, turned), (loaded.standing, np.eye(3))):
-                _write(program, "world_from_local", local)
-                _set(program, "is_object", float(part is loaded.thing))
-                loaded.colours.render(vertices=part[1], first=part[0])
+            for batch in loaded.batches:
+                _write(batch.program, "world_from_local", turned if batch.turning else np.eye(3))
+                batch.vertices.render(vertices=batch.count, first=batch.first)
             gl.depth_func = "<="
-            pixel = window.width / size[0]
-            rays = np.array(
-                [
-                    [window.width / 2, 0, window.x0 + window.width / 2 - shot.intrinsics.cx],
-                    [0, window.height / 2, window.y0 + window.height / 2 - shot.intrinsics.cy],
-                    [0, 0, shot.intrinsics.fx],
-                ]
-            )
-            rays[1] *= shot.intrinsics.fx / shot.intrinsics.fy
-            _write(self._backdrop, "ray_from_pixel", camera_from_world[:, :3].T @ rays)
-            _set(self._backdrop, "camera", tuple(centre))
-            angle = pixel / shot.intrinsics.fx
-            level = np.log2(max(around.panorama.shape[1] * angle / (2 * np.pi), 1.0))
-            _set(self._backdrop, "level", float(max(level + sharpness, 0.0)))
-            self._everywhere.render(vertices=3)
+            self._draw_backdrop(scene, shot, window, size[0], sharpness)
         gl.scissor = None
-        return _cut(np.frombuffer(frame.read(components=4), np.uint8), frame.size, len(windows), columns, size, 4)
+        return _cut(
+            np.frombuffer(frame.read(components=4), np.uint8), frame.size, len(windows), columns, size, 4
+        )
+
+    def _draw_backdrop(self, scene: Scene, shot: Shot, window: Window, width: int, sharpness: float) -> None:
+        program, k, around = self._backdrop, shot.intrinsics, scene.surroundings
+        camera_from_world = shot.camera_from_world
+        rays = np.array(
+            [
+                [window.width / 2 / k.fx, 0, (window.x0 + window.width / 2 - k.cx) / k.fx],
+                [0, window.height / 2 / k.fy, (window.y0 + window.height / 2 - k.cy) / k.fy],
+                [0, 0, 1],
+            ]
+        )
+        _write(program, "ray_from_pixel", camera_from_world[:, :3].T @ rays)
+        _set(program, "camera", tuple(-camera_from_world[:, :3].T @ camera_from_world[:, 3]))
+        # The seam of the panorama would upset the driver's own choice of level.
+        texels = around.panorama.shape[1] * window.width / width / k.fx / (2 * np.pi)
+        _set(program, "level", float(max(np.log2(max(texels, 1.0)) + sharpness, 0.0)))
+        self._everywhere.render(vertices=3)
 
     def _places(
         self, scene: Scene, loaded: _Uploaded, windows: Sequence[Window], size: tuple[int, int]
@@ -370,20 +400,23 @@ class Renderer:
             clip = _clip_from_camera(shot, window)
             object_clip = clip @ _homogeneous(shot.camera_from_object)
             world_clip = clip @ _homogeneous(shot.camera_from_world)
-            for part, matrix in (
-                (loaded.thing, object_clip),
-                (loaded.turning, object_clip),
-                (loaded.standing, world_clip),
+            for (first, count), matrix, is_object in (
+                (loaded.thing, object_clip, 1.0),
+                (loaded.ground, object_clip if scene.surroundings.ground_turns else world_clip, 0.0),
+                (loaded.clutter, world_clip, 0.0),
             ):
                 _write(self._place, "clip_from_local", matrix)
-                _set(self._place, "is_object", float(part is loaded.thing))
-                loaded.places.render(vertices=part[1], first=part[0])
+                _set(self._place, "is_object", is_object)
+                loaded.places.render(vertices=count, first=first)
         gl.scissor = None
         raw = np.frombuffer(frame.read(components=4, dtype="f4"), np.float32)
         cells = _cut(raw, frame.size, len(windows), columns, size, 4)
         return np.where(cells[..., 3:] > 0.5, cells[..., :3], np.nan).astype(np.float16)
 
-    def _cast_shadow(self, loaded: _Uploaded, world_from_object: FloatArray, to_light: FloatArray) -> None:
+    def _cast_shadow(
+        self, loaded: _Uploaded, world_from_object: FloatArray, to_light: FloatArray
+    ) -> FloatArray:
+        """Draw the shadow map and return its texture coordinates from world ones, (4, 4)."""
         gl = self._gl
         self._shadow_frame.use()
         self._shadow_frame.clear(depth=1.0)
@@ -394,68 +427,165 @@ class Renderer:
         axes = np.stack([side, np.cross(to_light, side), -to_light])
         light_from_world = np.eye(4)
         light_from_world[:3, :3] = axes / np.array([[_SHADOW_REACH], [_SHADOW_REACH], [4 * _SHADOW_REACH]])
-        _write(self._depth, "clip_from_local", light_from_world @ _homogeneous(np.column_stack([world_from_object, np.zeros(3)])))
+        turned = np.eye(4)
+        turned[:3, :3] = world_from_object
+        _write(self._depth, "clip_from_local", light_from_world @ turned)
         loaded.depths.render(vertices=loaded.thing[1], first=loaded.thing[0])
-        _write(self._depth, "clip_from_local", light_from_world)
-        # The ground comes first among the standing parts and casts no shadow.
-        first, count = loaded.standing
-        loaded.depths.render(vertices=count - loaded.ground_count, first=first + loaded.ground_count)
+        if loaded.clutter[1]:
+            _write(self._depth, "clip_from_local", light_from_world)
+            loaded.depths.render(vertices=loaded.clutter[1], first=loaded.clutter[0])
         texture_from_clip = np.diag([0.5, 0.5, 0.5, 1.0])
         texture_from_clip[:3, 3] = 0.5
-        _write(self._surface, "shadow_from_world", texture_from_clip @ light_from_world)
+        return np.asarray(texture_from_clip @ light_from_world)
 
     def _atlas(self, count: int, size: tuple[int, int], dtype: str) -> tuple[int, moderngl.Framebuffer]:
         """Columns of the atlas, and a frame that holds ``count`` pictures."""
         columns = int(np.ceil(np.sqrt(count)))
         whole = (columns * size[0], -(-count // columns) * size[1])
-        if (*whole, dtype) not in self._atlases:
+        key = (*whole, dtype)
+        if key not in self._atlases:
             colour = self._gl.texture(whole, 4, dtype=dtype)
-            self._atlases[(*whole, dtype)] = self._gl.framebuffer([colour], self._gl.depth_renderbuffer(whole))
-        return columns, self._atlases[(*whole, dtype)]
+            self._atlases[key] = self._gl.framebuffer([colour], self._gl.depth_renderbuffer(whole))
+        return columns, self._atlases[key]
+
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Triangles that one call draws."""
+
+    program: moderngl.Program
+    vertices: moderngl.VertexArray
+    first: int
+    count: int
+    turning: bool
+    """Whether they move with the object."""
 
 
 class _Uploaded:
     """A scene's meshes and textures on the device, released on leaving."""
 
-    def __init__(self, gl: moderngl.Context, scene: Scene, colour: Any, depth: Any, place: Any) -> None:
+    def __init__(
+        self,
+        gl: moderngl.Context,
+        scene: Scene,
+        surface: Callable[[tuple[str, ...]], moderngl.Program],
+        depth: moderngl.Program,
+        place: moderngl.Program,
+    ) -> None:
         around = scene.surroundings
-        groups = (scene.thing.parts, around.turning, around.standing)
-        parts = [part for group in groups for part in group]
-        counts = [sum(part.mesh.triangles.size for part in group) for group in groups]
-        self.thing = (0, counts[0])
-        self.turning = (counts[0], counts[1])
-        self.standing = (counts[0] + counts[1], counts[2])
-        grounded = around.ground_z is not None and not around.turning
-        self.ground_count = around.standing[0].mesh.triangles.size if grounded else 0
+        # The object first: what it hides of the rest is then never shaded.
+        ground = () if around.ground is None else (around.ground,)
+        groups = [scene.thing.parts, ground, around.clutter]
+        turning = (True, around.ground_turns, False)
+        features = [
+            [_features(part, around.shadow > 0, k == 0) for part in group] for k, group in enumerate(groups)
+        ]
+        parts: list[Part] = []
+        batches: list[tuple[moderngl.Program, int, int, bool]] = []
+        runs: list[tuple[int, int]] = []
+        for k, group in enumerate(groups):
+            start = sum(part.mesh.triangles.size for part in parts)
+            for feature in sorted(set(features[k])):
+                alike = [part for part, own in zip(group, features[k], strict=True) if own == feature]
+                first = sum(part.mesh.triangles.size for part in parts)
+                parts += alike
+                count = sum(part.mesh.triangles.size for part in alike)
+                batches.append((surface(feature), first, count, turning[k]))
+            runs.append((start, sum(part.mesh.triangles.size for part in parts) - start))
+        self.thing, self.ground, self.clutter = runs
         size = max(256, max(part.texture.shape[0] for part in parts))
         layers = np.stack([_square(part.texture, size) for part in parts])
         self.textures = gl.texture_array((size, size, len(layers)), 3, layers.tobytes())
         self.textures.build_mipmaps()
-        self.textures.anisotropy = 4.0
-        panorama = around.panorama
-        self.panorama = gl.texture((panorama.shape[1], panorama.shape[0]), 3, np.ascontiguousarray(panorama).tobytes())
+        panorama = np.ascontiguousarray(around.panorama)
+        self.panorama = gl.texture((panorama.shape[1], panorama.shape[0]), 3, panorama.tobytes())
         self.panorama.build_mipmaps()
         self.panorama.repeat_y = False
-        dark = _contact(scene)
-        self.contact = gl.texture((_CONTACT_SIZE, _CONTACT_SIZE), 1, dark.tobytes())
+        self.ambient = _ambient(panorama)
+        self.mirrored = gl.texture((_MIRROR_SIZE, _MIRROR_SIZE), 3, _octahedral(panorama).tobytes())
+        self.mirrored.build_mipmaps()
+        self.contact = gl.texture((_CONTACT_SIZE, _CONTACT_SIZE), 1, _contact(scene).tobytes())
         self.contact.repeat_x = self.contact.repeat_y = False
         vertices, triangles = _interleaved(parts)
         self._vertices = gl.buffer(vertices.tobytes())
         self._triangles = gl.buffer(triangles.tobytes())
         colour_layout = (self._vertices, "3f 3f 2f 3f", "position", "normal", "uv", "material")
         place_layout = (self._vertices, f"3f {4 * (_VERTEX_FLOATS - 3)}x", "position")
-        self.colours = gl.vertex_array(colour, [colour_layout], self._triangles)
-        self.depths = gl.vertex_array(depth, [place_layout], self._triangles)
-        self.places = gl.vertex_array(place, [place_layout], self._triangles)
+        arrays = {batch[0]: self._array(gl, batch[0], colour_layout) for batch in batches}
+        self.batches = [
+            _Batch(program, arrays[program], first, count, turns) for program, first, count, turns in batches
+        ]
+        self.depths = self._array(gl, depth, place_layout)
+        self.places = self._array(gl, place, place_layout)
+
+    def _array(
+        self, gl: moderngl.Context, program: moderngl.Program, layout: tuple[Any, ...]
+    ) -> moderngl.VertexArray:
+        return gl.vertex_array(program, [layout], self._triangles)
 
     def __enter__(self) -> _Uploaded:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for thing in (self.colours, self.depths, self.places, self._vertices, self._triangles):
-            thing.release()
-        for texture in (self.textures, self.panorama, self.contact):
+        for array in {self.depths, self.places, *(batch.vertices for batch in self.batches)}:
+            array.release()
+        for buffer in (self._vertices, self._triangles):
+            buffer.release()
+        for texture in (self.textures, self.panorama, self.mirrored, self.contact):
             texture.release()
+
+
+def _features(part: Part, shadows: bool, is_object: bool) -> tuple[str, ...]:
+    wanted = {
+        "OBJECT": is_object,
+        "SHADOW": shadows,
+        "GLOSS": part.gloss > _GLOSSY,
+        "RELIEF": part.relief > 0,
+    }
+    return tuple(name for name, needed in wanted.items() if needed)
+
+
+def _ambient(panorama: npt.NDArray[np.uint8]) -> FloatArray:
+    """(9, 3) coefficients of the light that a white surface receives from all around, by its normal.
+
+    Second-order spherical harmonics (Ramamoorthi and Hanrahan 2001) with their constants multiplied
+    out, in the order of the shader.
+    """
+    small = cv2.resize(panorama, (32, 16), interpolation=cv2.INTER_AREA).astype(np.float64) / 255
+    polar = (np.arange(16) + 0.5) * np.pi / 16
+    azimuth = (np.arange(32) + 0.5) * np.pi / 16 - np.pi
+    z = np.broadcast_to(np.cos(polar)[:, None], (16, 32))
+    x, y = np.sin(polar)[:, None] * np.cos(azimuth), np.sin(polar)[:, None] * np.sin(azimuth)
+    solid_angle = np.sin(polar)[:, None, None] * (np.pi / 16) ** 2
+    basis = np.stack([np.ones_like(x), y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y])
+    squared = np.array([1, 3, 3, 3, 15, 15, 1.25, 15, 3.75]) / (4 * np.pi)
+    kernel = np.array([1] + [2 / 3] * 3 + [1 / 4] * 5)
+    moments = np.einsum("kij,ijc->kc", basis, small * small * solid_angle)
+    return np.asarray(moments * (squared * kernel)[:, None])
+
+
+def _octahedral(panorama: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """The panorama on the unfolded octahedron: a direction is looked up without trigonometry."""
+    grid = (np.arange(_MIRROR_SIZE) + 0.5) / _MIRROR_SIZE * 2 - 1
+    x, y = np.meshgrid(grid, grid)
+    z = 1 - np.abs(x) - np.abs(y)
+    fold = z < 0
+    x, y = (
+        np.where(fold, (1 - np.abs(y)) * np.where(x < 0, -1, 1), x),
+        np.where(fold, (1 - np.abs(x)) * np.where(y < 0, -1, 1), y),
+    )
+    length = np.sqrt(x * x + y * y + z * z)
+    small = cv2.resize(panorama, (256, 128), interpolation=cv2.INTER_AREA)
+    column = (np.arctan2(y, x) / (2 * np.pi) + 0.5) * 256 - 0.5
+    row = np.arccos(z / length) / np.pi * 128 - 0.5
+    seen = cv2.remap(
+        small,
+        column.astype(np.float32),
+        row.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.ascontiguousarray(seen)
 
 
 def _interleaved(parts: Sequence[Part]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
@@ -480,8 +610,7 @@ def _square(texture: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.uint8]:
 
 def _contact(scene: Scene) -> npt.NDArray[np.uint8]:
     """How much of the sky the object hides from the ground beneath it, seen from above, (64, 64)."""
-    ground = scene.surroundings.ground_z
-    if ground is None:
+    if scene.surroundings.ground is None:
         return np.zeros((_CONTACT_SIZE, _CONTACT_SIZE), np.uint8)
     dark = np.zeros((_CONTACT_SIZE, _CONTACT_SIZE), np.float32)
     rng = np.random.default_rng(0)
@@ -490,14 +619,20 @@ def _contact(scene: Scene) -> npt.NDArray[np.uint8]:
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         if area.sum() <= 0:
             continue
-        chosen = corners[np.searchsorted(np.cumsum(area) / area.sum(), rng.random(1500)).clip(0, len(area) - 1)]
+        chosen = corners[
+            np.searchsorted(np.cumsum(area) / area.sum(), rng.random(1500)).clip(0, len(area) - 1)
+        ]
         weight = rng.dirichlet((1, 1, 1), 1500)[..., None]
         points = (chosen * weight).sum(1)
-        cell = ((points[:, :2] / (2 * _CONTACT_REACH) + 0.5) * _CONTACT_SIZE).astype(int).clip(0, _CONTACT_SIZE - 1)
-        near = np.exp(-(points[:, 2] - ground) * 5)
+        cell = (
+            ((points[:, :2] / (2 * _CONTACT_REACH) + 0.5) * _CONTACT_SIZE)
+            .astype(int)
+            .clip(0, _CONTACT_SIZE - 1)
+        )
+        near = np.exp(-(points[:, 2] - scene.surroundings.ground_z) * 5)
         np.maximum.at(dark, (cell[:, 1], cell[:, 0]), near.astype(np.float32))
-    dark = cv2.GaussianBlur(cv2.dilate(dark, np.ones((3, 3))), (0, 0), 2.0)
-    return np.asarray(np.clip(dark * 1.2, 0, 1) * 255, np.uint8)
+    blurred = cv2.GaussianBlur(cv2.dilate(dark, np.ones((3, 3))), (0, 0), 2.0)
+    return np.asarray(np.clip(blurred * 1.2, 0, 1) * 255, np.uint8)
 
 
 def _clip_from_camera(shot: Shot, window: Window) -> FloatArray:
@@ -514,7 +649,9 @@ def _clip_from_camera(shot: Shot, window: Window) -> FloatArray:
     return matrix
 
 
-def _inside(shot: Shot, window: Window, size: tuple[int, int], corner: tuple[int, int]) -> tuple[int, int, int, int]:
+def _inside(
+    shot: Shot, window: Window, size: tuple[int, int], corner: tuple[int, int]
+) -> tuple[int, int, int, int]:
     """The part of the viewport that shows the image: beyond its border there is nothing to see."""
     left = max(0, round(-window.x0 / window.width * size[0]))
     top = max(0, round(-window.y0 / window.height * size[1]))
@@ -524,12 +661,28 @@ def _inside(shot: Shot, window: Window, size: tuple[int, int], corner: tuple[int
 
 
 def _cut(
-    flat: npt.NDArray[Any], whole: tuple[int, int], count: int, columns: int, size: tuple[int, int], channels: int
+    flat: npt.NDArray[Any],
+    whole: tuple[int, int],
+    count: int,
+    columns: int,
+    size: tuple[int, int],
+    channels: int,
 ) -> npt.NDArray[Any]:
     """The atlas as (count, height, width, channels)."""
     width, height = size
     grid = flat.reshape(whole[1] // height, height, columns, width, channels)
     return np.ascontiguousarray(grid.swapaxes(1, 2)).reshape(-1, height, width, channels)[:count]
+
+
+def _enlarged(size: tuple[int, int], factor: float) -> tuple[int, int]:
+    return round(size[0] * factor), round(size[1] * factor)
+
+
+def _shrunk(pictures: npt.NDArray[np.uint8], size: tuple[int, int]) -> npt.NDArray[np.uint8]:
+    """(N, H, W, 4) averaged down to size (width, height)."""
+    if pictures.shape[2:0:-1] == size:
+        return pictures
+    return np.stack([cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures])
 
 
 def _homogeneous(transform: FloatArray) -> FloatArray:
@@ -542,5 +695,9 @@ def _set(program: Any, name: str, value: object) -> None:
 
 
 def _write(program: Any, name: str, matrix: FloatArray) -> None:
+    _send(program, name, np.ascontiguousarray(matrix.T, np.float32).tobytes())
+
+
+def _send(program: Any, name: str, data: bytes) -> None:
     if name in program:
-        program[name].write(np.ascontiguousarray(matrix.T, np.float32).tobytes())
+        program[name].write(data)

@@ -28,7 +28,16 @@ if TYPE_CHECKING:
 
     FloatArray = npt.NDArray[np.float64]
 
-_IMAGE_SIZES = ((640, 480), (480, 640), (1280, 720), (720, 1280), (960, 960), (960, 640), (640, 960), (540, 960))
+_IMAGE_SIZES = (
+    (640, 480),
+    (480, 640),
+    (1280, 720),
+    (720, 1280),
+    (960, 960),
+    (960, 640),
+    (640, 960),
+    (540, 960),
+)
 
 
 class Motion(Enum):
@@ -42,11 +51,11 @@ class Motion(Enum):
 
 
 @dataclass(frozen=True)
-class ScanSettings:
+class ScanStyle:
     """How the cameras of a scan are drawn."""
 
     max_neighbour_degrees: tuple[float, float] = (15.0, 180.0)
-    """Each scan draws its largest angle between the viewing directions of successive views from this range."""
+    """Where each scan draws its largest angle between successive viewing directions from."""
     motions: tuple[float, float, float] = (0.55, 0.3, 0.15)
     """Shares of camera, turntable and handled scans."""
     free_roll: float = 0.15
@@ -54,7 +63,7 @@ class ScanSettings:
     crop_scale: tuple[float, float] = (1.1, 1.2)
     """The network's crop: side of the square relative to the box (RelPose++, training)."""
     crop_shift: float = 0.07
-    """Largest shift of the crop's centre, relative to its side."""
+    """Largest shift of the crop's centre, in sides of the box."""
     box_error: float = 0.04
     """Standard deviation of the box's edges, relative to its size: detectors are not exact."""
 
@@ -92,12 +101,14 @@ class Surroundings:
     """(3,) half extents of the box around the origin onto which the panorama is projected."""
     eye: FloatArray
     """(3,) where in that box the panorama was taken."""
-    standing: tuple[Part, ...] = ()
-    """Ground and clutter fixed in the world frame."""
-    turning: tuple[Part, ...] = ()
-    """A turntable's plate: fixed in the object frame."""
-    ground_z: float | None = None
-    """Height of the supporting plane; None where the object floats."""
+    ground: Part | None = None
+    """What the object stands on; None where it floats."""
+    ground_turns: bool = False
+    """Whether the ground is fixed in the object frame: a turntable's plate."""
+    ground_z: float = -1e3
+    """Height of the supporting plane."""
+    clutter: tuple[Part, ...] = ()
+    """Other things, fixed in the world frame."""
     to_light: FloatArray = field(default_factory=lambda: np.array([0.3, 0.2, 0.93]))
     """(3,) unit vector in the world frame."""
     key: FloatArray = field(default_factory=lambda: np.ones(3))
@@ -119,22 +130,22 @@ class Scene:
 
 
 def random_scene(
-    rng: np.random.Generator, views: int, settings: ScanSettings, assets: Assets | None = None
+    rng: np.random.Generator, views: int, style: ScanStyle, assets: Assets | None = None
 ) -> Scene:
     """Draw a scan.
 
     Args:
         rng: Source of everything; the same state gives the same scan.
         views: Photographs to take.
-        settings: How cameras are drawn.
+        style: How cameras are drawn.
         assets: Meshes and pictures beside the procedural ones.
     """
     thing = _posed(rng, objects.random_object(rng, assets))
-    motion = (Motion.CAMERA, Motion.TURNTABLE, Motion.HANDLED)[int(rng.choice(3, p=settings.motions))]
+    motion = (Motion.CAMERA, Motion.TURNTABLE, Motion.HANDLED)[int(rng.choice(3, p=style.motions))]
     points = _outline(thing)
     lowest = float(points[:, 2].min())
     grounded = motion is not Motion.HANDLED and rng.random() < 0.85
-    cameras = _cameras(rng, views, settings, grounded)
+    cameras = _cameras(rng, views, style, grounded)
     shots = []
     for rotation, translation, intrinsics, width, height in cameras:
         pose = np.column_stack([rotation, translation])
@@ -237,10 +248,10 @@ def _direction(azimuth: float, elevation: float) -> FloatArray:
 
 
 def _cameras(
-    rng: np.random.Generator, views: int, settings: ScanSettings, above_ground: bool
+    rng: np.random.Generator, views: int, style: ScanStyle, above_ground: bool
 ) -> list[tuple[FloatArray, FloatArray, Intrinsics, int, int]]:
     """Rotation, translation, intrinsics, width and height of each camera, in the object frame."""
-    largest_step = rng.uniform(*settings.max_neighbour_degrees)
+    largest_step = rng.uniform(*style.max_neighbour_degrees)
     toward = directions(rng, views, largest_step, above_ground=above_ground)
     width, height = _IMAGE_SIZES[int(rng.integers(len(_IMAGE_SIZES)))]
     focal = max(width, height) / 2 / np.tan(np.radians(rng.uniform(22, 80)) / 2)
@@ -250,7 +261,7 @@ def _cameras(
     wandering = rng.uniform(0.02, 0.18)
     aim = rng.uniform(0.02, 0.25) * (1.0 if filling > 0.6 else 2.0)
     roll = rng.uniform(0, 6)
-    free_roll = rng.random() < settings.free_roll
+    free_roll = rng.random() < style.free_roll
     cx, cy = width / 2 + rng.normal(0, 0.01) * width, height / 2 + rng.normal(0, 0.01) * height
     cameras = []
     for direction in toward:
@@ -264,11 +275,13 @@ def _cameras(
     return cameras
 
 
-def _world_from_object(rng: np.random.Generator, motion: Motion, camera_from_object: FloatArray) -> FloatArray:
+def _world_from_object(
+    rng: np.random.Generator, motion: Motion, camera_from_object: FloatArray
+) -> FloatArray:
     if motion is Motion.CAMERA:
         return np.eye(3)
     if motion is Motion.HANDLED:
-        return so3.random_rotations(1, rng)[0]
+        return np.asarray(so3.random_rotations(1, rng)[0])
     # The plate has turned such that the camera stands at azimuth 0 of the room.
     forward = camera_from_object[2]
     angle = -np.arctan2(-forward[1], -forward[0])
@@ -289,12 +302,11 @@ def _surroundings(
     half = farthest * rng.uniform(1.15, 4) * np.array([1.0, rng.uniform(0.7, 1.4), rng.uniform(0.6, 1.0)])
     half = np.maximum(half, farthest * 1.1) * (20.0 if rng.random() < 0.25 else 1.0)
     eye = half * rng.uniform(-0.4, 0.4, 3) * (1, 1, 0.5)
-    standing: list[Part] = []
-    turning: list[Part] = []
+    ground, turns, clutter = None, False, []
     if ground_z is not None:
         ground, extent = _ground(rng, ground_z, farthest, panorama if studio else None, assets)
-        (turning if motion is Motion.TURNTABLE and rng.random() < 0.6 else standing).append(ground)
-        standing += _clutter(rng, ground_z, extent, points, assets)
+        turns = motion is Motion.TURNTABLE and rng.random() < 0.6
+        clutter = _clutter(rng, ground_z, extent, points, assets)
     elevation, azimuth = np.radians(rng.uniform(25, 85)), rng.uniform(0, 2 * np.pi)
     strength = rng.uniform(0.25, 1.1)
     tint = 1 + rng.normal(0, 0.06) * np.array([1.0, 0.1, -1.0])
@@ -302,9 +314,10 @@ def _surroundings(
         panorama=panorama,
         room_half=half,
         eye=eye,
-        standing=tuple(standing),
-        turning=tuple(turning),
-        ground_z=ground_z,
+        ground=ground,
+        ground_turns=turns,
+        ground_z=-1e3 if ground_z is None else ground_z,
+        clutter=tuple(clutter),
         to_light=_direction(float(np.degrees(azimuth)), float(np.degrees(elevation))),
         key=strength * tint,
         ambient=float(rng.uniform(0.5, 1.3)),
@@ -317,7 +330,8 @@ def _backdrop(rng: np.random.Generator, assets: Assets | None, studio: bool) -> 
         shade = rng.uniform(0.75, 1.0) if rng.random() < 0.7 else rng.uniform(0.02, 0.7)
         colour = np.clip(shade + rng.normal(0, 0.03, 3), 0, 1)
         glow = np.linspace(1.0, rng.uniform(0.6, 1.0), 64)[:, None, None]
-        return np.asarray(np.broadcast_to(np.clip(colour * glow * 255, 0, 255), (64, 128, 3)), np.uint8).copy()
+        shaded = np.clip(colour * glow * 255, 0, 255).astype(np.uint8)
+        return np.repeat(shaded, 128, axis=1)
     if assets is not None and assets.panoramas and rng.random() < 0.75:
         panorama = read_picture(assets.panoramas[int(rng.integers(len(assets.panoramas)))])
     else:
@@ -347,8 +361,15 @@ def _ground(
         mesh = shapes.Mesh(slab.positions, slab.normals, slab.positions[:, :2] / tile, slab.triangles)
     angle = rng.uniform(0, 2 * np.pi)
     c, s = np.cos(angle), np.sin(angle)
-    mesh = mesh.transformed(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]), (*rng.normal(0, 0.15, 2), z - 1e-3))
-    return Part(mesh, texture, gloss=float(rng.uniform(0, 0.4) * rng.random()), relief=float(rng.uniform(0, 0.02))), extent
+    mesh = mesh.transformed(
+        np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]), (*rng.normal(0, 0.15, 2), z - 1e-3)
+    )
+    return Part(
+        mesh,
+        texture,
+        gloss=float(rng.uniform(0, 0.4) * (rng.random() < 0.3)),
+        relief=float(rng.uniform(0, 0.02) * (rng.random() < 0.5)),
+    ), extent
 
 
 def _clutter(

@@ -87,7 +87,10 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def creased(
-    positions: npt.ArrayLike, triangles: npt.ArrayLike, uvs: npt.ArrayLike, crease_degrees: float = CREASE_DEGREES
+    positions: npt.ArrayLike,
+    triangles: npt.ArrayLike,
+    uvs: npt.ArrayLike,
+    crease_degrees: float = CREASE_DEGREES,
 ) -> Mesh:
     """Give a mesh without normals smooth ones, with hard edges where faces meet at a large angle.
 
@@ -236,7 +239,7 @@ def box(extents: npt.ArrayLike = (1.0, 1.0, 1.0), *, atlas: bool = False) -> Mes
         positions.append((normal + square[:, :1] * right + square[:, 1:] * up) * half)
         normals.append(np.tile(normal, (4, 1)))
         uv = (square * (1, -1) + 1) / 2
-        uvs.append((uv + (face % 3, face // 3)) / (3, 2) if atlas else uv)
+        uvs.append((uv + np.array([face % 3, face // 3])) / (3, 2) if atlas else uv)
         triangles.append(np.array([[0, 1, 2], [0, 2, 3]]) + 4 * face)
     return Mesh(*(np.concatenate(parts) for parts in (positions, normals, uvs, triangles)))
 
@@ -266,7 +269,8 @@ def tube(path: npt.ArrayLike, radii: npt.ArrayLike, *, sides: int = 12, flatteni
     circle = np.cos(angle)[:, None, None] * a - flattening * np.sin(angle)[:, None, None] * b
     side = grid_surface((points + radius[:, None] * circle).swapaxes(0, 1), v_repeat=2.0)
     ends = [
-        _fan(points[k] + radius[k] * circle[:-1, k][::order], tangent[k] * -order) for k, order in ((0, 1), (-1, -1))
+        _fan(points[k] + radius[k] * circle[:-1, k][::order], tangent[k] * -order)
+        for k, order in ((0, 1), (-1, -1))
     ]
     return merge([side, *ends])
 
@@ -346,4 +350,6 @@ def smooth_path(points: npt.ArrayLike, count: int) -> FloatArray:
     segment = np.minimum(place.astype(int), len(p) - 2)
     t = (place - segment)[:, None]
     a, b, c, d = (padded[segment + k] for k in range(4))
-    return np.asarray(0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3))
+    return np.asarray(
+        0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
+    )

@@ -29,7 +29,12 @@ _FONTS = (
     cv2.FONT_HERSHEY_TRIPLEX,
     cv2.FONT_HERSHEY_SCRIPT_COMPLEX,
 )
-_SYLLABLES = tuple("ba co di fe gu ha jo ka lu mi no pe ra su to vi wa xe yo zu an or el is th qu".split())
+# fmt: off
+_SYLLABLES = (
+    "ba", "co", "di", "fe", "gu", "ha", "jo", "ka", "lu", "mi", "no", "pe", "ra",
+    "su", "to", "vi", "wa", "xe", "yo", "zu", "an", "or", "el", "is", "th", "qu",
+)
+# fmt: on
 
 
 def fractal_noise(
@@ -63,7 +68,9 @@ def pattern(number: int, size: int = 256) -> Image:
     y, x = np.mgrid[0:size, 0:size] / size
     kind = number % 12
     if kind in (0, 1, 2):
-        grey = fractal_noise(rng, (size, size), coarsest=int(rng.integers(2, 24)), roughness=rng.uniform(0.4, 0.95))
+        grey = fractal_noise(
+            rng, (size, size), coarsest=int(rng.integers(2, 24)), roughness=rng.uniform(0.4, 0.95)
+        )
     elif kind == 3:
         # Marble and wood: rings or lines bent by noise.
         bend = fractal_noise(rng, (size, size), coarsest=3, roughness=0.5) * rng.uniform(0.5, 4)
@@ -100,7 +107,9 @@ def _dots(rng: np.random.Generator, size: int) -> FloatArray:
     image = np.zeros((size, size), np.uint8)
     for _ in range(int(rng.integers(6, 60))):
         centre = rng.integers(0, size, 2).tolist()
-        cv2.circle(image, centre, int(rng.integers(2, size // 8)), int(rng.integers(60, 255)), -1, cv2.LINE_AA)
+        cv2.circle(
+            image, centre, int(rng.integers(2, size // 8)), int(rng.integers(60, 255)), -1, cv2.LINE_AA
+        )
     return image / 255.0
 
 
@@ -152,12 +161,13 @@ def _shapes(rng: np.random.Generator, size: int) -> FloatArray:
 def random_colour(rng: np.random.Generator) -> FloatArray:
     """(3,) RGB 0..1. Greys and browns are as common as strong colours, as on real things."""
     kind = rng.random()
-    if kind < 0.3:
+    if kind < 0.35:
         return np.clip(rng.uniform(0.05, 0.95) + rng.normal(0, 0.03, 3), 0, 1)
-    if kind < 0.5:
+    if kind < 0.6:
         earth = np.array([0.62, 0.45, 0.3]) * rng.uniform(0.3, 1.4) + rng.normal(0, 0.06, 3)
         return np.clip(earth, 0, 1)
-    return np.asarray(rng.random(3))
+    colour = rng.random(3)
+    return np.asarray(colour + (colour.mean() - colour) * rng.uniform(0, 0.7))
 
 
 def palette(rng: np.random.Generator, stops: int | None = None, contrast: float = 1.0) -> Image:
@@ -180,7 +190,17 @@ def surface(rng: np.random.Generator, size: int = 256, contrast: float | None = 
     """A random material, (size, size, 3)."""
     if contrast is None:
         contrast = rng.uniform(0.1, 0.5) if rng.random() < 0.5 else rng.uniform(0.5, 1)
-    return coloured(pattern(int(rng.integers(PATTERN_COUNT)), size), palette(rng, contrast=contrast))
+    picture = coloured(pattern(int(rng.integers(PATTERN_COUNT)), size), palette(rng, contrast=contrast))
+    return worn(picture, rng) if rng.random() < 0.5 else picture
+
+
+def worn(picture: Image, rng: np.random.Generator) -> Image:
+    """Dirt, fading and grain over a (H, W, 3) texture: real surfaces are seldom as clean as patterns."""
+    mask = pattern(12 * int(rng.integers(PATTERN_COUNT // 12)) + int(rng.integers(3)))
+    height, width = picture.shape[:2]
+    shade = cv2.resize(mask, (width, height)).astype(np.float32) / 255 - 0.5
+    strength = rng.uniform(0.1, 0.7)
+    return np.asarray(np.clip(picture * (1 + strength * shade[..., None]), 0, 255), np.uint8)
 
 
 def word(rng: np.random.Generator) -> str:
@@ -208,7 +228,8 @@ def label(rng: np.random.Generator, height: int, width: int) -> Image:
     """A printed label: a plain or patterned ground, panels, words, small print, a bar code."""
     if rng.random() < 0.4:
         grey = pattern(int(rng.integers(PATTERN_COUNT)))
-        image = cv2.resize(coloured(grey, palette(rng, contrast=rng.uniform(0.2, 1))), (width, height))
+        colours = palette(rng, contrast=rng.uniform(0.2, 1))
+        image = np.asarray(cv2.resize(coloured(grey, colours), (width, height)), np.uint8)
     else:
         image = np.empty((height, width, 3), np.uint8)
         image[:] = (random_colour(rng) * 255).astype(np.uint8)
@@ -292,7 +313,9 @@ def _furnish(canvas: Image, rng: np.random.Generator, horizon: int, indoors: boo
     height, width = canvas.shape[:2]
     w, h = (rng.uniform(0.01, 0.12) * width, rng.uniform(0.02, 0.35 if indoors else 0.2) * height)
     x = rng.uniform(-0.05, 1) * width
-    bottom = horizon + rng.uniform(-0.25, 0.2) * height if indoors else horizon + rng.uniform(-0.01, 0.06) * height
+    bottom = (
+        horizon + rng.uniform(-0.25, 0.2) * height if indoors else horizon + rng.uniform(-0.01, 0.06) * height
+    )
     x0, y0, x1, y1 = int(x), int(bottom - h), int(x + w), int(bottom)
     kind = rng.random()
     colour = (random_colour(rng) * 255).astype(int).tolist()

@@ -1,0 +1,138 @@
+"""Rendered scans on disk, for a trainer that reads faster than anybody can draw.
+
+A shard is a folder of .npy files with one row per scan, all of them memory-mappable:
+
+    images.npy              (M, N, S, S, 3) uint8, RGB crops
+    places.npy              (M, N, S/8, S/8, 3) float16, object coordinates seen at the cells' centres,
+                            NaN off the object
+    crop_parameters.npy     (M, N, 3) float32, as the network takes them
+    camera_from_object.npy  (M, N, 3, 4) float32, optical; unit: the object's bounding radius
+    intrinsics.npy          (M, N, 4) float32, fx, fy, cx, cy of the full image, pixels
+    crops.npy               (M, N, 3) float32, left, top, side of the crop in the full image, pixels
+    image_sizes.npy         (M, N, 2) int32, width and height of the full image
+    complete.npy            (M, N) bool, whether the whole object is in the photograph
+    symmetry.npy            (M, 5) float32: kind (0 none, 1 discrete, 2 continuous), order (0 continuous or
+                            unknown), axis in the object frame (NaN where unknown)
+    motion.npy              (M,) uint8: 0 camera, 1 turntable, 2 handled
+    names.npy               (M,) text
+
+Shard k holds the scans k M to k M + M - 1 of its seed; a shard that stands in its place is whole.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import shutil
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from relpose_ros.captures.assets import load_assets
+from relpose_ros.captures.scans import PLACE_STRIDE, RenderedScan, ScanRenderer
+from relpose_ros.captures.scenes import Motion, ScanStyle
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy.typing as npt
+
+
+@dataclass(frozen=True)
+class ShardPlan:
+    """What the shards of one folder hold."""
+
+    seed: int = 0
+    scans: int = 100
+    """Per shard."""
+    views: int = 10
+    """Per scan: more than a training sample takes, which chooses among them."""
+    image_size: int = 128
+    assets: Path | None = None
+    split: str = "train"
+    style: ScanStyle = field(default_factory=ScanStyle)
+
+
+def write_shards(folder: Path, count: int, plan: ShardPlan, *, processes: int = 1) -> None:
+    """Write shards 0 to count - 1 of a plan; those that stand already are left alone.
+
+    Args:
+        folder: Gets one sub-folder per shard, ``00000`` and on.
+        count: Shards.
+        plan: Must be the same when a folder is continued.
+        processes: Each opens its own OpenGL context.
+
+    Raises:
+        RenderError: There is no OpenGL here.
+        AssetsError: The assets folder is not one.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [k for k in range(count) if not (folder / f"{k:05d}").exists()]
+    task = partial(_write_shard, folder, plan)
+    progress = partial(tqdm, total=len(missing), unit="shard", desc=f"{plan.scans * plan.views} images each")
+    if processes <= 1:
+        for _ in progress(map(task, missing)):
+            pass
+        return
+    # A forked process would share its parent's OpenGL connection.
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for _ in progress(pool.imap_unordered(task, missing)):
+            pass
+
+
+def read_shard(folder: Path) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of one shard by name, memory-mapped."""
+    return {path.stem: np.load(path, mmap_mode="r") for path in sorted(folder.glob("*.npy"))}
+
+
+_renderers: dict[ShardPlan, ScanRenderer] = {}
+"""One per process: opening a context and reading the assets takes longer than many scans."""
+
+
+def _write_shard(folder: Path, plan: ShardPlan, number: int) -> None:
+    if plan not in _renderers:
+        assets = None if plan.assets is None else load_assets(plan.assets, plan.split)
+        _renderers[plan] = ScanRenderer(plan.seed, plan.image_size, assets=assets, style=plan.style)
+    renderer = _renderers[plan]
+    m, n, s, cells = plan.scans, plan.views, plan.image_size, plan.image_size // PLACE_STRIDE
+    unfinished = folder / f"{number:05d}.unfinished"
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir()
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "images": np.empty((m, n, s, s, 3), np.uint8),
+        "places": np.empty((m, n, cells, cells, 3), np.float16),
+        "crop_parameters": np.empty((m, n, 3), np.float32),
+        "camera_from_object": np.empty((m, n, 3, 4), np.float32),
+        "intrinsics": np.empty((m, n, 4), np.float32),
+        "crops": np.empty((m, n, 3), np.float32),
+        "image_sizes": np.empty((m, n, 2), np.int32),
+        "complete": np.empty((m, n), np.bool_),
+        "symmetry": np.empty((m, 5), np.float32),
+        "motion": np.empty(m, np.uint8),
+        "names": np.empty(m, "U64"),
+    }
+    for row in range(m):
+        _fill(arrays, row, renderer.scan(number * m + row, n))
+    for name, array in arrays.items():
+        np.save(unfinished / f"{name}.npy", array)
+    unfinished.rename(folder / f"{number:05d}")
+
+
+def _fill(arrays: dict[str, npt.NDArray[Any]], row: int, scan: RenderedScan) -> None:
+    for name in (
+        "images",
+        "places",
+        "crop_parameters",
+        "camera_from_object",
+        "intrinsics",
+        "crops",
+        "image_sizes",
+        "complete",
+    ):
+        arrays[name][row] = getattr(scan, name)
+    axis = (np.nan,) * 3 if scan.symmetry.axis is None else scan.symmetry.axis
+    arrays["symmetry"][row] = (int(scan.symmetry.kind), scan.symmetry.order, *axis)
+    arrays["motion"][row] = list(Motion).index(scan.motion)
+    arrays["names"][row] = scan.name
