@@ -1,0 +1,106 @@
+"""The rotation grid: sizes, nesting, equal volumes, and HEALPix against its published ring formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from relpose_ros.geometry import so3, so3_grid
+
+LEVELS = (0, 1, 2, 3)
+
+
+def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(A, 3, 3) and (B, 3, 3) -> (A, B) angles in rad, to about 1e-7: one matrix product, for large grids."""
+    trace = a.reshape(-1, 9) @ b.reshape(-1, 9).T
+    return np.arccos(np.clip((trace - 1) / 2, -1, 1))
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_level_has_as_many_different_rotations_as_it_says(level: int) -> None:
+    cells = so3_grid.grid(level)
+    assert cells.shape == (72 * 8**level, 3, 3)
+    assert cells @ cells.swapaxes(1, 2) == pytest.approx(np.broadcast_to(np.eye(3), cells.shape), abs=1e-12)
+    assert np.linalg.det(cells) == pytest.approx(1)
+    sample = cells[:: max(1, len(cells) // 300)]
+    closest = np.partition(angles(sample, cells), 1, axis=1)
+    assert closest[:, 0] == pytest.approx(0, abs=1e-6)
+    assert closest[:, 1].min() > 0.3 * so3_grid.cell_spacing(level)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_every_rotation_is_near_a_cell(level: int) -> None:
+    drawn = so3.random_rotations(200, np.random.default_rng(level))
+    nearest = angles(drawn, so3_grid.grid(level)).min(1)
+    assert nearest.max() < 0.85 * so3_grid.cell_spacing(level)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_children_lie_around_their_parent(level: int) -> None:
+    parents = so3_grid.grid(level)
+    offspring = so3_grid.grid(level + 1).reshape(len(parents), 8, 3, 3)
+    distance = so3.angle_between(offspring, parents[:, None])
+    assert distance.max() < 0.75 * so3_grid.cell_spacing(level)
+    centred = so3.angle_between(so3.project(offspring.sum(1)), parents)
+    assert centred.max() < 0.2 * so3_grid.cell_spacing(level)
+    assert (so3_grid.children([5, 2]) // 8).tolist() == [5] * 8 + [2] * 8
+
+
+def test_cells_have_equal_volumes() -> None:
+    """Descendants fill a cell evenly, so random rotations fall evenly on level-0 cells by nearest descendant."""
+    drawn = so3.random_rotations(6000, np.random.default_rng(1))
+    fine = so3_grid.grid(2)
+    nearest = np.concatenate([np.argmin(angles(part, fine), 1) for part in np.split(drawn, 6)])
+    counts = np.bincount(nearest // 64, minlength=72)
+    expected = len(drawn) / 72
+    assert ((counts - expected) ** 2 / expected).sum() < 120  # chi squared, 71 degrees of freedom
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_first_axes_are_the_healpix_centres_of_the_ring_formulas(level: int) -> None:
+    """Gorski et al. 2005, equations 2 to 9: rings of equal height, which a nested order must visit too."""
+    side = 2**level
+    rings = []
+    for ring in range(1, 4 * side):
+        from_pole = min(ring, 4 * side - ring)
+        if from_pole < side:
+            height, count, offset = 1 - from_pole**2 / (3 * side**2), 4 * from_pole, 0.5
+        else:
+            height, count, offset = (
+                4 / 3 - 2 * from_pole / (3 * side),
+                4 * side,
+                0.5 * ((ring - side + 1) % 2),
+            )
+        azimuth = (np.arange(count) + offset) * 2 * np.pi / count
+        height = height if ring <= 2 * side else -height
+        radius = np.sqrt(1 - height**2)
+        rings.append(
+            np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.full(count, height)], -1)
+        )
+    expected = np.concatenate(rings)
+    axes = so3_grid.grid(level)[:, :, 2]
+    assert len(expected) * 6 * side == len(axes)
+    assert ((expected @ axes.T > 1 - 1e-12).sum(1) == 6 * side).all()
+
+
+def test_single_cells_are_those_of_the_whole_level() -> None:
+    cells = np.array([0, 71, 72 * 8 - 1, 300])
+    assert np.array_equal(so3_grid.cell_rotations(1, cells), so3_grid.grid(1)[cells])
+    assert so3_grid.cell_rotations(6, [72 * 8**6 - 1]).shape == (1, 3, 3)
+
+
+def test_the_shared_grid_cannot_be_written() -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        so3_grid.grid(0)[0] = 0
+
+
+@pytest.mark.parametrize("level", [-1, 9])
+def test_there_are_no_other_levels(level: int) -> None:
+    with pytest.raises(ValueError, match=f"there is no level {level}"):
+        so3_grid.grid(level)
+
+
+@pytest.mark.parametrize("cell", [-1, 72])
+def test_there_are_no_other_cells(cell: int) -> None:
+    with pytest.raises(ValueError, match="72 cells"):
+        so3_grid.cell_rotations(0, [cell])
