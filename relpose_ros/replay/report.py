@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,7 +79,7 @@ def write_report(
             {
                 "picture": "data:image/jpeg;base64," + base64.b64encode(record.picture).decode("ascii"),
                 "corners": _rounded(record.corners),
-                "name": f"{record.view.stamp_ns / 1e9:.3f} s",
+                "name": f"{(record.view.stamp_ns - recording.views[0].view.stamp_ns) / 1e9:.2f} s",
             }
             for record in recording.views
         ],
@@ -95,7 +96,8 @@ def write_report(
         "title": f"{recording.object_id} in {bag_name}",
         "verdict": "Enough to act on" if last.estimate.verdict == Verdict.ENOUGH else "One more view needed",
         "verdict_class": "enough" if last.estimate.verdict == Verdict.ENOUGH else "more",
-        "status": _sentence(last.estimate.status),
+        # The verdict stands above it already.
+        "status": _sentence(re.sub("^(enough|one more view): ", "", last.estimate.status)),
         "facts": " ".join(_facts(recording, last, comparison)),
     }
     page = TEMPLATE.read_text(encoding="utf-8")
