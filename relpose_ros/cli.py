@@ -66,7 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     node = command("node", _node, "Run the ROS 2 node: images in, camera poses and their uncertainty out.")
     _add_weights(node)
     node.add_argument(
-        "ros_arguments", nargs=argparse.REMAINDER, help="--ros-args and what follows goes to ROS as it is"
+        "--ros-args", nargs=argparse.REMAINDER, default=[], help="all that follows goes to ROS as it is"
     )
 
     replay = command(
@@ -162,7 +162,7 @@ def _node(arguments: argparse.Namespace) -> int:
     weights = arguments.weights
     # Quoted as YAML, which is how ROS reads a parameter: a file may be named 12.
     given = [] if weights is None else ["--ros-args", "-p", f"weights:='{weights}'", "--"]
-    return run_node([*given, *arguments.ros_arguments])
+    return run_node([*given, "--ros-args", *arguments.ros_args])
 
 
 def _replay(arguments: argparse.Namespace) -> int:
