@@ -11,7 +11,7 @@ unexport PYTHONHOME PYTHONOPTIMIZE PYTHONPATH PYTHONSAFEPATH
 
 # Python edits are live; a change in one of these is not, until the package is installed again.
 INSTALLED := CMakeLists.txt constraints.txt package.xml pyproject.toml setup.py \
-	$(wildcard build_support/* config/* launch/* msg/*)
+	$(filter-out %/__pycache__,$(wildcard build_support/* config/* launch/* msg/*))
 
 .PHONY: setup demo test lint bench train evaluate bags clean check
 
