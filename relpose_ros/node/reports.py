@@ -97,6 +97,7 @@ def diagnostic_status(
     state: str,
     failure: str,
     statistics: Statistics | None,
+    publishers: Mapping[str, int],
     longest_callbacks_s: Mapping[str, float],
     incompatible: Mapping[str, str],
 ) -> DiagnosticStatus:
@@ -107,6 +108,7 @@ def diagnostic_status(
         state: Its lifecycle state.
         failure: Why the last configuration failed; empty where it did not.
         statistics: The scanner's; None while there is none.
+        publishers: How many of them each topic listens to: none is why nothing arrives.
         longest_callbacks_s: Seconds of the slowest callback so far, by topic.
         incompatible: What to do about QoS that does not fit, by topic.
     """
@@ -121,6 +123,7 @@ def diagnostic_status(
     if failure:
         level, message = DiagnosticStatus.ERROR, failure
     values = [("state", state), *((f"{topic} QoS", advice) for topic, advice in incompatible.items())]
+    values += ((f"{topic} publishers", str(count)) for topic, count in publishers.items())
     values += ((f"{topic} slowest callback ms", f"{1e3 * s:.2f}") for topic, s in longest_callbacks_s.items())
     if statistics is not None:
         values += _statistics_values(statistics)

@@ -141,6 +141,7 @@ class ScanNode(LifecycleNode):
         self._jump: Any = None
         self._incompatible: dict[str, tuple[bool, str]] = {}
         self._longest_callback_s: dict[str, float] = {}
+        self._publishers_of: dict[str, int] = {}
         self._throttle = Throttle()
         # A service that waits for an estimate must not hold up the callbacks of images.
         self._waiting_group = MutuallyExclusiveCallbackGroup()
@@ -149,6 +150,8 @@ class ScanNode(LifecycleNode):
         )
         self._diagnostics_timer: Any = None
         self._set_diagnostics_timer()
+        change_state = self._service_change_state
+        change_state.callback = functools.partial(self._on_change_state, change_state.callback)
         self.add_on_set_parameters_callback(self._judge_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
 
@@ -273,8 +276,10 @@ class ScanNode(LifecycleNode):
         for kind, name, message_type in [*wanted, ("camera_info", "camera_info", CameraInfo)]:
             topic = self.resolve_topic_name(name)
             events = SubscriptionEventCallbacks(
-                incompatible_qos=functools.partial(self._on_incompatible_qos, topic, True)
+                incompatible_qos=functools.partial(self._on_incompatible_qos, topic, True),
+                matched=functools.partial(self._on_matched, topic),
             )
+            self._publishers_of[topic] = 0
             subscription = self.create_subscription(
                 message_type,
                 name,
@@ -302,6 +307,7 @@ class ScanNode(LifecycleNode):
         self._estimate_asked = False
         self._incompatible.clear()
         self._longest_callback_s.clear()
+        self._publishers_of.clear()
 
     # Messages in.
 
@@ -331,6 +337,9 @@ class ScanNode(LifecycleNode):
         advice = qos_advice(topic, QoSPolicyKind(event.last_policy_kind), subscribing=subscribing)
         self._incompatible[topic] = (subscribing, advice)
         self.get_logger().warning(advice)
+
+    def _on_matched(self, topic: str, event: Any) -> None:
+        self._publishers_of[topic] = event.current_count
 
     # Estimates out: the worker's side.
 
@@ -433,6 +442,15 @@ class ScanNode(LifecycleNode):
             return None
         return self._scanner
 
+    def _on_change_state(self, change: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+        # A transition that the state does not allow makes rclpy raise, and the client would wait for ever.
+        try:
+            return change(request, response)
+        except Exception as err:
+            self.get_logger().warning(f"The transition {request.transition.id} is refused: {err}")
+            response.success = False
+            return response
+
     # Parameters.
 
     def _judge_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
@@ -474,6 +492,7 @@ class ScanNode(LifecycleNode):
             self._state_machine.current_state[1],
             self._failure,
             scanner.statistics() if scanner is not None else None,
+            dict(self._publishers_of),
             dict(self._longest_callback_s),
             self._incompatible_now(),
         )

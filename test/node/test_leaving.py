@@ -1,0 +1,122 @@
+"""How the node starts badly, and how it leaves: a process for each case, most of them without the network."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from lifecycle_msgs.msg import Transition
+from rclpy.duration import Duration
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from relpose_ros.msg import ScanEstimate
+from sensor_msgs.msg import Image
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+BOTH = pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+FOR_EVER_S = 1000.0
+
+
+@BOTH
+def test_a_signal_while_waiting(how: signal.Signals, start_without_network: Callable[..., Any]) -> None:
+    node = start_without_network()
+    node.wait_for("Waiting for views")
+    assert node.end(how) == 0
+    assert not node.told("Traceback"), list(node.lines)
+
+
+@BOTH
+def test_a_signal_while_loading(how: signal.Signals, start_without_network: Callable[..., Any]) -> None:
+    node = start_without_network(loading_s=FOR_EVER_S)
+    node.wait_for("loading")
+    assert node.end(how) == 0
+    assert not node.told("Traceback"), list(node.lines)
+
+
+@BOTH
+def test_a_signal_during_an_estimate(
+    how: signal.Signals, start_without_network: Callable[..., Any], new_graph: Any, make: Any
+) -> None:
+    node = start_without_network("diagnostics_period_s:=0.1", estimating_s=FOR_EVER_S)
+    node.wait_for("Waiting for views")
+    new_graph.publish("/object_view", *(make.object_view(10.0 + k, "mug") for k in range(2)))
+    node.wait_for("estimating")
+    assert node.end(how) == 0
+    assert not node.told("Traceback"), list(node.lines)
+
+
+def test_a_clock_that_jumps_back_resets_the_scans(
+    start_without_network: Callable[..., Any], new_graph: Any, make: Any
+) -> None:
+    """And, in the same process, an estimator that fails, and a QoS override that fits no publisher."""
+    node = start_without_network(
+        "use_sim_time:=true",
+        "diagnostics_period_s:=0.1",
+        "qos_overrides./image.subscription.reliability:=reliable",
+    )
+    node.wait_for("Waiting for views")
+    new_graph.set_clock(100)
+    new_graph.publish("/object_view", *(make.object_view(100.0 + k, "mug") for k in range(2)))
+    node.wait_for("ERROR", "'mug'", "cannot estimate")
+    assert new_graph.diagnostic("failed estimates") == "1"
+    assert new_graph.diagnostic("mug views") == "2"
+    new_graph.set_clock(50)
+    node.wait_for("the clock jumped backwards by 50.000 s")
+    new_graph.wait_until(lambda: new_graph.diagnostic("mug views") is None, "a scan that is forgotten")
+
+    new_graph.node.create_publisher(
+        Image, "/image", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
+    node.wait_for("WARN", "/image", "qos_overrides./image.subscription.reliability", "best_effort")
+    assert "/image" in new_graph.wait_until(
+        lambda: new_graph.diagnostic("/image QoS"), "the same in the diagnostics"
+    )
+    impatient = QoSProfile(depth=1, deadline=Duration(seconds=1))
+    new_graph.collect(ScanEstimate, "/scan_node/estimate", impatient)
+    node.wait_for("WARN", "/scan_node/estimate", "deadline")
+    assert node.end() == 0
+
+
+def test_without_autostart_it_waits_for_a_manager(
+    start_without_network: Callable[..., Any], new_graph: Any
+) -> None:
+    node = start_without_network("autostart:=false", "image_transports:=[compressed]", "diagnostics:=false")
+    assert new_graph.state() == "unconfigured"
+    assert new_graph.change_state(Transition.TRANSITION_CONFIGURE)
+    assert new_graph.state() == "inactive"
+    assert not new_graph.trigger("reset").success
+    assert new_graph.node.count_subscribers("/image/compressed") == 1
+    assert new_graph.node.count_subscribers("/image") == 0
+    assert new_graph.change_state(Transition.TRANSITION_INACTIVE_SHUTDOWN)
+    assert new_graph.state() == "finalized"
+    assert node.end() == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--ros-args", "-p", "max_views:=9"], ["max_views", "9"]),
+        (["--ros-args", "-p", "keep:=some"], ["keep", "'some'", "spread"]),
+        (["--ros-args", "-p", "backward_jump_s:=soon"], ["backward_jump_s", "soon"]),
+        (["--help-me"], ["--help-me", "--ros-args"]),
+        (["--ros-args", "--params-file", "nowhere.yaml"], ["nowhere.yaml"]),
+    ],
+)
+def test_a_wrong_argument_is_one_sentence(
+    arguments: list[str], words: list[str], start: Callable[..., Any]
+) -> None:
+    node = start(*arguments)
+    assert node.process.wait(60.0) != 0
+    node.kill()
+    (line,) = node.lines
+    assert all(word in line for word in words)
+
+
+def test_the_node_module_leaves_pytorch_alone() -> None:
+    """It takes seconds to import, in which a signal would end the process with a traceback."""
+    program = "import sys, relpose_ros.node.scan_node; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

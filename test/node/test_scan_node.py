@@ -1,0 +1,253 @@
+"""The node over real DDS: views go in from this process, estimates come out of another one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from lifecycle_msgs.msg import Transition
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from relpose_ros.msg import ScanEstimate
+from visualization_msgs.msg import Marker
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+OBJECT_VIEW, IMAGE, COMPRESSED, CAMERA_INFO = "/object_view", "/image", "/image/compressed", "/camera_info"
+
+
+@pytest.fixture
+def node(running: Any, graph: Any) -> Iterator[Any]:
+    """That node without any view, and no message of an earlier test on its way."""
+    graph.forget()
+    running.lines.clear()
+    yield running
+    assert running.process.poll() is None, "the node did not survive"
+
+
+def stamp_s(message: Any) -> float:
+    return float(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
+
+
+def test_poses_come_from_the_second_view_on(node: Any, graph: Any, make: Any) -> None:
+    graph.publish(OBJECT_VIEW, make.object_view(10.0, "mug"))
+    graph.wait_until(lambda: graph.diagnostic("mug views") == "1", "the first view")
+    answer = graph.trigger("estimate_now")
+    assert (answer.success, answer.message) == (False, "No object has two views yet.")
+    assert not graph.estimates
+    graph.publish(OBJECT_VIEW, make.object_view(11.0, "mug"))
+    first = graph.estimate_of("mug", views=2)
+    assert [(pair.i, pair.j) for pair in first.pairs] == [(0, 1)]
+    graph.publish(OBJECT_VIEW, make.object_view(12.0, "mug"))
+    second = graph.estimate_of("mug", views=3)
+    assert [stamp_s(camera) for camera in second.cameras] == [10.0, 11.0, 12.0]
+    assert second.header.frame_id == "object"
+    assert stamp_s(second) == 12.0
+    assert second.seconds > 0.0
+
+    poses = graph.wait_until(lambda: [p for p in graph.poses if len(p.poses) == 3], "poses")[0]
+    assert poses.header == second.header
+    assert poses.poses == [camera.pose.pose for camera in second.cameras]
+    markers = graph.wait_until(
+        lambda: [m for m in graph.markers if m.markers[-1].header == second.header], "markers"
+    )
+    assert markers[0].markers[0].action == Marker.DELETEALL
+
+
+@pytest.mark.parametrize("reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT])
+def test_images_with_camera_infos_of_either_kind_of_publisher(
+    node: Any, graph: Any, make: Any, reliability: ReliabilityPolicy
+) -> None:
+    for stamp in (10.0, 10.5):
+        graph.publish(IMAGE, make.image(stamp), reliability=reliability)
+        graph.publish(CAMERA_INFO, make.camera_info(stamp), reliability=reliability)
+    assert len(graph.estimate_of("object", views=2).pairs) == 1
+
+
+def test_compressed_images(node: Any, graph: Any, make: Any) -> None:
+    stamps = (10.0, 10.5, 11.0)
+    graph.publish(CAMERA_INFO, *(make.camera_info(stamp) for stamp in stamps))
+    graph.publish(COMPRESSED, *(make.compressed(stamp) for stamp in stamps))
+    assert stamp_s(graph.estimate_of("object", views=3)) == 11.0
+
+
+def test_who_comes_late_gets_the_last_estimate(node: Any, graph: Any, make: Any) -> None:
+    graph.publish(OBJECT_VIEW, *(make.object_view(stamp, "mug") for stamp in (10.0, 11.0)))
+    last = graph.estimate_of("mug", views=2)
+    qos = QoSProfile(
+        depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+    )
+    late = graph.collect(ScanEstimate, "/scan_node/estimate", qos)
+    graph.wait_until(lambda: late, "the estimate that was published before")
+    assert late == [last]
+
+
+def test_objects_are_estimated_apart(node: Any, graph: Any, make: Any) -> None:
+    views = [make.object_view(10.0 + k, object_id) for k in range(2) for object_id in ("mug", "bowl")]
+    graph.publish(OBJECT_VIEW, *views, make.object_view(12.0, "mug"))
+    assert stamp_s(graph.estimate_of("mug", views=3)) == 12.0
+    assert stamp_s(graph.estimate_of("bowl", views=2)) == 11.0
+
+
+def test_a_burst_of_fifty_views(node: Any, graph: Any, make: Any) -> None:
+    stamps = [10.0 + 0.1 * k for k in range(50)]
+    before = graph.count(OBJECT_VIEW, "received")
+    assert graph.set_parameter("keep", "latest") == (True, "")
+    try:
+        graph.publish(OBJECT_VIEW, *(make.object_view(stamp, "mug") for stamp in stamps))
+        graph.wait_until(
+            lambda: any(stamp_s(each) == pytest.approx(stamps[-1]) for each in graph.estimates),
+            "the last view",
+        )
+        last = max(graph.estimates, key=stamp_s)
+        assert [stamp_s(camera) for camera in last.cameras] == pytest.approx(
+            [14.2 + 0.1 * k for k in range(8)]
+        )
+        assert graph.count(OBJECT_VIEW, "received") == before + 50
+        print(f"{len(graph.estimates)} estimates of 50 views that came at once")
+    finally:
+        assert graph.set_parameter("keep", "spread") == (True, "")
+
+
+def test_garbage_in_between_costs_nothing(node: Any, graph: Any, make: Any) -> None:
+    truncated, unknown, empty = (make.object_view(11.0 + 0.1 * k, "mug") for k in range(3))
+    truncated.image.data = truncated.image.data[:100]
+    unknown.image.encoding = "32FC1"
+    empty.image.width = 0
+    outside = make.object_view(11.3, "mug")
+    outside.box.x_offset = 4000
+    not_a_number = make.object_view(11.4, "mug")
+    not_a_number.k[0] = float("nan")
+    no_jpeg = make.compressed(11.5)
+    no_jpeg.data = no_jpeg.data[40:]
+    garbage = [truncated, unknown, empty, outside, not_a_number]
+
+    rejected = graph.count(OBJECT_VIEW, "rejected")
+    graph.publish(OBJECT_VIEW, make.object_view(10.0, "mug"), *garbage)
+    graph.publish(CAMERA_INFO, make.camera_info(11.5))
+    graph.publish(COMPRESSED, no_jpeg)
+    graph.publish(OBJECT_VIEW, make.object_view(12.0, "mug"), make.object_view(9.5, "mug"))
+    estimate = graph.estimate_of("mug", views=2)
+    assert [stamp_s(camera) for camera in estimate.cameras] == [10.0, 12.0]
+    graph.wait_until(lambda: graph.count(OBJECT_VIEW, "rejected") == rejected + 6, "six rejections")
+    for stamp in ("11.000", "11.100", "11.200", "11.300", "11.400", "9.500"):
+        assert node.told("WARN", OBJECT_VIEW, stamp), (stamp, list(node.lines))
+    assert node.told("WARN", COMPRESSED, "11.500")
+
+
+def test_the_same_garbage_again_and_again_is_told_once(node: Any, graph: Any, make: Any) -> None:
+    rejected = graph.count(OBJECT_VIEW, "rejected")
+    for k in range(20):
+        view = make.object_view(20.0 + k, "cup")
+        view.box.height = 0
+        graph.publish(OBJECT_VIEW, view)
+    graph.wait_until(lambda: graph.count(OBJECT_VIEW, "rejected") == rejected + 20, "twenty rejections")
+    assert len(node.told("WARN", OBJECT_VIEW)) == 1
+    assert "39.000" in graph.diagnostic(f"{OBJECT_VIEW} last rejection")
+
+
+def test_a_bag_that_loops_starts_the_scan_anew(node: Any, graph: Any, make: Any) -> None:
+    loop = [100.0 + k for k in range(4)]
+    graph.publish(OBJECT_VIEW, *(make.object_view(stamp, "mug") for stamp in loop))
+    graph.estimate_of("mug", views=4)
+    graph.estimates.clear()
+    graph.publish(OBJECT_VIEW, *(make.object_view(stamp, "mug") for stamp in loop[:3]))
+    estimate = graph.estimate_of("mug", views=3)
+    assert [stamp_s(camera) for camera in estimate.cameras] == loop[:3]
+    assert node.told("jumped backwards")
+
+
+def test_services(node: Any, graph: Any, make: Any) -> None:
+    assert not graph.trigger("drop_last_view").success
+    graph.publish(OBJECT_VIEW, *(make.object_view(10.0 + k, "mug") for k in range(3)))
+    graph.estimate_of("mug", views=3)
+    graph.estimates.clear()
+    answer = graph.trigger("drop_last_view")
+    assert answer.success
+    assert "mug" in answer.message
+    assert stamp_s(graph.estimate_of("mug", views=2)) == 11.0
+    graph.estimates.clear()
+    answer = graph.trigger("estimate_now")
+    assert answer.success
+    assert answer.message == f"mug: {graph.estimate_of('mug', views=2).status}"
+    graph.markers.clear()
+    answer = graph.trigger("reset")
+    assert (answer.success, answer.message) == (True, "2 views forgotten.")
+    graph.wait_until(lambda: graph.markers, "markers that clear the screen")
+    assert [each.action for each in graph.markers[0].markers] == [Marker.DELETEALL]
+
+
+def test_parameters_are_described_and_judged(node: Any, graph: Any) -> None:
+    limits = graph.descriptor("max_views").integer_range[0]
+    assert (limits.from_value, limits.to_value) == (2, 8)
+    assert "latest" in graph.descriptor("keep").additional_constraints
+    for name, value, complaint in (
+        ("max_views", 9, "max_views"),
+        ("max_views", "many", "INTEGER"),
+        ("keep", "nonsense", "first, latest, spread"),
+        ("object_frame", "", "object_frame"),
+        ("object_frame", None, ""),
+        ("backward_jump_s", float("nan"), "backward_jump_s"),
+        ("weights", "/elsewhere", "clean the node up"),
+    ):
+        accepted, reason = graph.set_parameter(name, value)
+        assert not accepted, (name, value)
+        assert complaint in reason
+    assert graph.set_parameter("object_frame", "thing") == (True, "")
+    assert graph.set_parameter("object_frame", "object") == (True, "")
+
+
+def test_how_long_a_full_hd_frame_holds_the_callbacks(node: Any, graph: Any, make: Any) -> None:
+    key = f"{IMAGE} slowest callback ms"
+    before = graph.count(IMAGE, "received")
+    for k in range(10):
+        stamp = 10.0 + k
+        graph.publish(CAMERA_INFO, make.camera_info(stamp, 1920, 1080))
+        graph.publish(IMAGE, make.image(stamp, 1920, 1080))
+    graph.wait_until(lambda: graph.count(IMAGE, "received") > before, "an image")
+    print(f"1920x1080 rgb8: slowest callback {graph.diagnostic(key)} ms")
+    graph.estimate_of("object", views=2)
+
+
+def test_transitions(node: Any, graph: Any, make: Any, tmp_path: Path) -> None:
+    graph.publish(OBJECT_VIEW, *(make.object_view(10.0 + k, "mug") for k in range(2)))
+    graph.estimate_of("mug", views=2)
+
+    assert graph.change_state(Transition.TRANSITION_DEACTIVATE)
+    assert not graph.trigger("estimate_now").success
+    graph.publish(OBJECT_VIEW, make.object_view(12.0, "mug"))
+    assert not graph.change_state(Transition.TRANSITION_CONFIGURE), "it is configured"
+    assert graph.state() == "inactive"
+    assert graph.change_state(Transition.TRANSITION_ACTIVATE)
+    graph.publish(OBJECT_VIEW, make.object_view(13.0, "mug"))
+    estimate = graph.estimate_of("mug", views=3)
+    assert [stamp_s(camera) for camera in estimate.cameras] == [10.0, 11.0, 13.0]
+
+    weights = graph.parameter("weights")
+    threads = []
+    for _ in range(2):
+        assert graph.change_state(Transition.TRANSITION_DEACTIVATE)
+        assert graph.change_state(Transition.TRANSITION_CLEANUP)
+        assert graph.state() == "unconfigured"
+        graph.wait_until(lambda: graph.node.count_subscribers(OBJECT_VIEW) == 0, "topics that are gone")
+        threads.append(node.threads())
+
+        nowhere = str(tmp_path / "nowhere.safetensors")
+        assert graph.set_parameter("weights", nowhere) == (True, "")
+        assert not graph.change_state(Transition.TRANSITION_CONFIGURE)
+        assert graph.state() == "unconfigured"
+        assert node.told("ERROR", nowhere)
+        assert nowhere in graph.diagnostics().message
+
+        assert graph.set_parameter("weights", weights) == (True, "")
+        assert graph.change_state(Transition.TRANSITION_CONFIGURE)
+        assert graph.change_state(Transition.TRANSITION_ACTIVATE)
+    assert threads[0] == threads[1]
+    graph.publish(OBJECT_VIEW, *(make.object_view(20.0 + k, "mug") for k in range(4)))
+    assert stamp_s(graph.estimate_of("mug", views=4)) == 23.0
+
+
+def test_it_leaves_with_zero(running: Any) -> None:
+    assert running.end() == 0
+    assert not running.told("Traceback"), list(running.lines)
