@@ -199,8 +199,10 @@ def _packed(raw: _Raw, region: Region, channels: int, conversion: int | None) ->
 
 
 def _deep(raw: _Raw, region: Region) -> Pixels:
-    values = raw.block(region, 2).view(">u2" if raw.big_endian else "<u2").astype(np.uint32)
-    return _converted(((values + 128) // 257).astype(np.uint8), cv2.COLOR_GRAY2RGB)
+    values = raw.block(region, 2).view(">u2" if raw.big_endian else "<u2").astype(np.uint16)
+    return _converted(
+        np.asarray(cv2.convertScaleAbs(values, alpha=255 / 65535), np.uint8), cv2.COLOR_GRAY2RGB
+    )
 
 
 def _nv21(raw: _Raw, region: Region) -> Pixels:
@@ -212,11 +214,10 @@ def _nv21(raw: _Raw, region: Region) -> Pixels:
 def _nv24(raw: _Raw, region: Region) -> Pixels:
     chroma = _Raw(raw.data[raw.step * raw.height :], 2 * raw.step, raw.height, raw.big_endian)
     luma = raw.block(region, 1)
+    u, v = cv2.split(chroma.block(region, 2).reshape(*luma.shape, 2))
     # OpenCV has no nv24; as uyvy with every luma sample twice it is the same colours at twice the width.
-    uyvy = np.empty((*luma.shape, 4), np.uint8)
-    uyvy[..., 0::2] = chroma.block(region, 2).reshape(*luma.shape, 2)
-    uyvy[..., 1::2] = luma[..., None]
-    return _converted(uyvy.reshape(luma.shape[0], -1, 2), cv2.COLOR_YUV2RGB_UYVY)[:, ::2]
+    uyvy = cv2.merge([u, luma, v, luma]).reshape(luma.shape[0], -1, 2)
+    return _converted(np.asarray(uyvy, np.uint8), cv2.COLOR_YUV2RGB_UYVY)[:, ::2]
 
 
 def _converted(pixels: Pixels, conversion: int) -> Pixels:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ from relpose_ros.geometry import so3
 from relpose_ros.scanning.outgoing import TYPE_NAMES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from relpose_ros.views import Scan
 
@@ -232,6 +233,16 @@ class CircleEstimator:
         self.scans.append(scan)
         azimuths = [np.radians(self.azimuth_deg(view.stamp_ns * 1e-9)) for view in scan.views]
         return estimate_of(scan, azimuths)
+
+
+@pytest.fixture
+def quiet_log() -> Iterator[None]:
+    """Keeps the log of thousands of messages out of memory."""
+    logger = logging.getLogger("relpose_ros")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    yield
+    logger.setLevel(level)
 
 
 @pytest.fixture

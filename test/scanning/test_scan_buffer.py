@@ -1,11 +1,10 @@
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from relpose_ros.scanning.scan_buffer import (
@@ -280,6 +279,30 @@ def test_a_failed_estimate_is_tried_again_with_the_next_view() -> None:
     assert retried.views == work.views
 
 
+def test_a_trial_that_fails_leaves_the_views_as_they_are(circle_estimator: Callable[..., Any]) -> None:
+    buffer = buffer_with(1, 2, keep="spread", max_views=2)
+    estimate_all(buffer, circle_estimator())
+    add(buffer, 9)
+    work = buffer.work()
+    assert work is not None
+    buffer.give_up(work)
+    assert not buffer.has_work()
+    assert stamps_of(buffer) == [1, 2]
+    assert buffer.dropped == 1
+    add(buffer, 10)
+    assert estimate_all(buffer, circle_estimator()) == [True, True]
+    assert stamps_of(buffer) == [1, 10]
+
+
+def test_a_failure_of_views_forgotten_meanwhile_says_nothing_about_the_others() -> None:
+    buffer = buffer_with(1, 2, 3)
+    work = buffer.work()
+    assert work is not None
+    buffer.drop_last()
+    buffer.give_up(work)
+    assert buffer.has_work()
+
+
 def test_other_settings_let_go_of_what_is_too_much() -> None:
     for keep, left in (("first", [1, 2, 3]), ("latest", [3, 4, 5]), ("spread", [1, 2, 3])):
         buffer = buffer_with(1, 2, 3, 4, 5, keep="latest")
@@ -300,7 +323,8 @@ def test_the_most_redundant_view_is_the_one_with_the_closest_neighbours() -> Non
     np.testing.assert_allclose(np.degrees(nearest_angles(directions(0, 40, 50, 120))), [40, 10, 10, 70])
 
 
-@settings(max_examples=500)
+@pytest.mark.usefixtures("quiet_log")
+@settings(max_examples=500, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.lists(st.tuples(st.sampled_from("ab"), st.floats(0, 20)), max_size=40),
     st.sampled_from(["first", "latest", "spread"]),
@@ -308,7 +332,6 @@ def test_the_most_redundant_view_is_the_one_with_the_closest_neighbours() -> Non
 def test_whatever_stamps_come_the_views_are_ordered_and_all_accounted_for(
     arrivals: list[tuple[str, float]], keep: str
 ) -> None:
-    logging.getLogger("relpose_ros").setLevel(logging.ERROR)
     buffer = ScanBuffer("mug", ScanSettings(keep=keep, max_views=3))
     for topic, stamp in arrivals:
         before = buffer.views

@@ -535,6 +535,7 @@ ARRIVALS = st.lists(
 )
 
 
+@pytest.mark.usefixtures("quiet_log")
 @settings(max_examples=400, suppress_health_check=list(HealthCheck))
 @given(arrivals=ARRIVALS, keep=st.sampled_from(["first", "latest", "spread"]))
 def test_sixteen_thousand_malformed_messages_cost_no_view(
@@ -545,7 +546,6 @@ def test_sixteen_thousand_malformed_messages_cost_no_view(
     No exception escapes, none is needed as a safety net either, and a message that is not accepted leaves the
     views that are held as they are.
     """
-    logging.getLogger("relpose_ros").setLevel(logging.CRITICAL)
     scanner = Scanner(circle_estimator(), ScanSettings(keep=keep, max_views=3, pairing_queue=3, max_scans=2))
     send_views(scanner, bag_messages, 4, 4.5, object_id="object")
     held = held_views(scanner)
