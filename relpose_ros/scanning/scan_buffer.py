@@ -21,6 +21,11 @@ SPREAD_MARGIN = np.radians(1.0)
 """How much further from all others than the most redundant view a newcomer must look, so that the noise of
 two estimates does not swap views of a camera that stands still."""
 
+SHORTEST_PAUSE_NS, LONGEST_PAUSE_NS = 200_000_000, 1_000_000_000
+"""After a newcomer that gained nothing, how long the next ones are not tried (keep policy "spread"). The
+pause doubles each time: a camera that stands still must not keep the estimator busy for ever, and one that
+moves on is soon tried again. By stamps, so that a replay does the same."""
+
 _SEEN = 64
 """Stamps remembered to tell a picture that comes raw and compressed: no transport lags by more pictures."""
 
@@ -66,6 +71,7 @@ class ScanBuffer:
         self._views: list[View] = []
         self._candidates: deque[View] = deque()
         self._on_trial: View | None = None
+        self._pause_ns = self._paused_until_ns = 0
         self._newest_on: dict[str, int] = {}
         self._suspects: dict[str, View] = {}
         self._seen: deque[int] = deque(maxlen=_SEEN)
@@ -95,7 +101,8 @@ class ScanBuffer:
             return Decision(
                 False, f"{late}, whose newest view has stamp {stamp_text(newest_ns)}", rejected=True
             )
-        if self._settings.keep == "first" and len(self._views) >= self._settings.max_views:
+        full = len(self._views) >= self._settings.max_views
+        if full and (self._settings.keep == "first" or self._is_paused(stamp_ns)):
             return self._decline_further(stamp_ns, topic)
         return None
 
@@ -159,11 +166,12 @@ class ScanBuffer:
         self._on_trial = None
         before = nearest_angles(viewing_directions(self._base)).min()
         after = nearest_angles(viewing_directions(estimate))[-1]
+        self.dropped += 1
         if not after > before + SPREAD_MARGIN:
-            self.dropped += 1
+            self._pause(work.newcomer.stamp_ns)
             return False
         self._views, self._base = list(work.views), estimate
-        self.dropped += 1
+        self._pause_ns = self._paused_until_ns = 0
         return True
 
     def give_up(self, work: Work) -> None:
@@ -217,13 +225,27 @@ class ScanBuffer:
     def _decline_further(self, stamp_ns: int, topic: str) -> Decision:
         self._note_time(stamp_ns, topic)
         self.dropped += 1
-        return Decision(False, f"the scan of {self.object_id!r} has its {len(self._views)} views")
+        text = f"the scan of {self.object_id!r} has its {len(self._views)} views"
+        if self._is_paused(stamp_ns):
+            text += ", and one seen just before it gained nothing"
+        return Decision(False, text)
 
     def _note_time(self, stamp_ns: int, topic: str) -> None:
         """Time goes on in this topic: whatever lay far behind was garbage."""
         self._seen.append(stamp_ns)
         self._newest_on[topic] = stamp_ns
         self._suspects.pop(topic, None)
+
+    def _pause(self, stamp_ns: int) -> None:
+        """Try no newcomer for a while after one that gained nothing."""
+        self._pause_ns = min(max(2 * self._pause_ns, SHORTEST_PAUSE_NS), LONGEST_PAUSE_NS)
+        self._paused_until_ns = stamp_ns + self._pause_ns
+        while self._candidates and self._is_paused(self._candidates[0].stamp_ns):
+            self._candidates.popleft()
+            self.dropped += 1
+
+    def _is_paused(self, stamp_ns: int) -> bool:
+        return self._settings.keep == "spread" and stamp_ns < self._paused_until_ns
 
     def _jumps_back(self, stamp_ns: int, topic: str) -> bool:
         # Each topic's own clock: another one may lag behind by more than any jump.
@@ -253,6 +275,7 @@ class ScanBuffer:
         self._epoch += 1
         left = [view for view in self._all() if view not in views]
         self._on_trial = None
+        self._pause_ns = self._paused_until_ns = 0
         self._views = left[: self._settings.max_views]
         self._candidates = deque(left[self._settings.max_views :])
         self._changed, self._base = True, None

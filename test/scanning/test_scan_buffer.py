@@ -130,6 +130,38 @@ def test_a_still_camera_does_not_swap_views_for_noise(circle_estimator: Callable
     assert stamps_of(buffer) == [0, 1, 2]
 
 
+def test_after_a_newcomer_in_vain_the_next_ones_wait_longer_and_longer(
+    circle_estimator: Callable[..., Any],
+) -> None:
+    azimuths = {4.0: 2.0, 4.2: 2.0, 4.6: 2.0, 5.4: 2.0, 6.4: 2.0, 7.4: 170.0, 7.5: 100.0}
+    estimator = circle_estimator(lambda stamp: azimuths.get(round(stamp, 1), 30.0 * (stamp - 1)))
+    buffer = buffer_with(1, 2, 3, keep="spread", max_views=3)
+    estimate_all(buffer, estimator)
+    tried = []
+    for tenth in range(40, 76):
+        (decision,) = add(buffer, tenth / 10)
+        if decision.accepted:
+            tried.append(tenth / 10)
+            estimate_all(buffer, estimator)
+        else:
+            assert (
+                decision.reason
+                == "the scan of 'mug' has its 3 views, and one seen just before it gained nothing"
+            )
+    assert tried == [4.0, 4.2, 4.6, 5.4, 6.4, 7.4, 7.5], "at once again after one that gained"
+    assert stamps_of(buffer) == [1, 7.4, 7.5]
+
+
+def test_those_that_wait_behind_a_newcomer_in_vain_go_with_it(circle_estimator: Callable[..., Any]) -> None:
+    azimuths = {1.0: 0.0, 2.0: 90.0, 3.0: 90.5, 3.1: 45.0, 3.3: 170.0}
+    estimator = circle_estimator(lambda stamp: azimuths[round(stamp, 1)])
+    buffer = buffer_with(1, 2, keep="spread", max_views=2)
+    estimate_all(buffer, estimator)
+    add(buffer, 3, 3.1, 3.3)
+    assert estimate_all(buffer, estimator) == [False, True], "3.1 is not tried"
+    assert stamps_of(buffer) == [1, 3.3]
+
+
 def test_spread_takes_newcomers_in_turn_and_lets_the_oldest_go(circle_estimator: Callable[..., Any]) -> None:
     estimator = circle_estimator(lambda stamp: 3.0 * stamp)
     buffer = buffer_with(*range(50), keep="spread", max_views=4)
@@ -174,6 +206,12 @@ def test_a_lone_stamp_of_the_future_is_found_out(keep: str, caplog: pytest.LogCa
     assert third.accepted
     assert stamps_of(buffer) == [1, 2, 3, 4, 5]
     assert "stamp 1000000.000000000 is dropped: two later messages are older" in caplog.text
+
+
+def test_the_first_views_fill_the_place_of_one_that_was_garbage() -> None:
+    buffer = buffer_with(1, 2, 1e6, keep="first", max_views=3)
+    assert [each.accepted for each in add(buffer, 3, 4)] == [False, False]
+    assert stamps_of(buffer) == [1, 2, 3]
 
 
 @pytest.mark.parametrize("keep", ["first", "latest", "spread"])

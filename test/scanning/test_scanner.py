@@ -536,9 +536,9 @@ ARRIVALS = st.lists(
 
 
 @pytest.mark.usefixtures("quiet_log")
-@settings(max_examples=400, suppress_health_check=list(HealthCheck))
+@settings(max_examples=300, suppress_health_check=list(HealthCheck))
 @given(arrivals=ARRIVALS, keep=st.sampled_from(["first", "latest", "spread"]))
-def test_sixteen_thousand_malformed_messages_cost_no_view(
+def test_twelve_thousand_malformed_messages_cost_no_view(
     bag_messages: Any, circle_estimator: Callable[..., Any], arrivals: list[Any], keep: str
 ) -> None:
     """The fields of good messages are replaced by what lies at their limits and beyond.
