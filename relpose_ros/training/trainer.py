@@ -1,0 +1,469 @@
+"""The training loop: on one processor, one GPU, or several machines; stopped and resumed at will.
+
+Whatever is random in a step is drawn from the seed, the step's number and the process's rank, and the
+learning rate depends on the images seen. So a run that is resumed goes on as if it had never stopped.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+import time
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import distributed
+from torch.nn.parallel import DistributedDataParallel
+
+from relpose_ros.errors import RelPoseError
+from relpose_ros.geometry import so3, so3_grid
+from relpose_ros.network.checkpoint import random_network, write_network
+from relpose_ros.network.presets import PRESETS
+from relpose_ros.training.batches import Augmentation, Scans, make_batch
+from relpose_ros.training.objective import Batch, Objective, ObjectiveSettings, Targets, make_targets
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from relpose_ros.network.relpose import RelPose
+
+    State = dict[str, Any]
+
+PIECE_BYTES = 16 * 2**20
+"""Size of the pieces a checkpoint is cut into, so that it passes through stores that refuse large files."""
+CURVE = "curve.csv"
+WEIGHTS = "weights.safetensors"
+_COLUMNS = ("step", "images", "seconds", "images_per_second", "learning_rate", "max_angle")
+_LOSSES = ("loss", "rotation_nats", "translation", "match_nats")
+
+
+class TrainingError(RelPoseError):
+    """Training cannot start or go on."""
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How a network is trained. `settings_for` gives those of a preset."""
+
+    preset: str = "compact"
+    images: int = 600_000
+    """Images seen in the whole run, each time an image is seen counting once."""
+    batch_images: int = 64
+    """Images a step and process: as many scans as fit."""
+    min_views: int = 2
+    max_views: int = 8
+    learning_rate: float = 6e-4
+    warmup_images: int = 12_000
+    decay: float = 0.4
+    """Share of the run, at its end, over which the learning rate falls to 0."""
+    weight_decay: float = 0.01
+    gradient_norm: float = 1.0
+    average_images: int = 20_000
+    """Images over which the averaged weights, those that are measured and written, forget."""
+    curriculum: tuple[tuple[float, float], ...] = ((0.0, 45.0), (0.25, 90.0), (0.5, 180.0))
+    """(share of the run, degrees): from then on, views of a scan lie within that angle of one of them."""
+    precision: str = "bfloat16"
+    """Of the forward pass: float32, bfloat16, or float16 (GPU)."""
+    objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
+    augmentation: Augmentation = field(default_factory=Augmentation)
+    seed: int = 0
+
+
+def settings_for(preset: str) -> TrainingSettings:
+    """The published run for ``paper``, ours for ``compact``.
+
+    Raises:
+        TrainingError: There is no such preset.
+    """
+    if preset == "paper":
+        return TrainingSettings(
+            preset="paper",
+            images=800_000 * 48 * 8,
+            batch_images=48 * 8,
+            learning_rate=1e-5,
+            warmup_images=0,
+            decay=0.0,
+            curriculum=((0.0, 180.0),),
+        )
+    if preset == "compact":
+        return TrainingSettings(
+            objective=ObjectiveSettings(uniform_rotations=256, near_rotations=128, pairs=8, match_weight=0.5)
+        )
+    text = f"there is no preset {preset!r}; choose among {', '.join(PRESETS)}."
+    raise TrainingError(text)
+
+
+class Trainer:
+    """A run in a folder: its curve, its latest checkpoint, and the weights averaged so far."""
+
+    def __init__(
+        self,
+        settings: TrainingSettings,
+        folder: Path,
+        scans: Scans,
+        held_out: Scans | None = None,
+        *,
+        device: str = "cpu",
+    ) -> None:
+        """Begin a run, or go on with the one in the folder.
+
+        Under torchrun every process makes one of these with the same arguments; gloo or NCCL joins them.
+
+        Args:
+            settings: May differ from those of the checkpoint, for instance to end a run sooner.
+            folder: Of the run, made if it is missing.
+            scans: To learn from.
+            held_out: To measure on, other objects.
+            device: Of this process.
+
+        Raises:
+            TrainingError: The checkpoint is damaged or of another network.
+        """
+        self.settings = settings
+        self.folder = folder
+        self._scans, self._held_out = scans, held_out
+        self._device = torch.device(device)
+        self._rank, self._processes = _join(self._device)
+        folder.mkdir(parents=True, exist_ok=True)
+        preset = PRESETS[settings.preset]
+        self.network = random_network(preset, settings.seed).to(self._device).train()
+        self.average = (
+            random_network(preset, settings.seed).to(self._device).requires_grad_(requires_grad=False)
+        )
+        decayed = [p for p in self.network.parameters() if p.ndim > 1]
+        plain = [p for p in self.network.parameters() if p.ndim <= 1]
+        self._optimizer = torch.optim.AdamW(
+            [
+                {"params": decayed, "weight_decay": settings.weight_decay},
+                {"params": plain, "weight_decay": 0.0},
+            ],
+            lr=settings.learning_rate,
+        )
+        self._scaler = torch.amp.GradScaler(enabled=settings.precision == "float16")
+        objective = Objective(self.network, settings.objective)
+        self._objective: torch.nn.Module = objective
+        if self._processes > 1:
+            # Ablations leave parts of the network unused.
+            self._objective = DistributedDataParallel(objective, find_unused_parameters=True)
+        self.step = 0
+        self.images = 0
+        self._seconds = 0.0
+        if (folder / "checkpoint.json").exists():
+            self._resume()
+
+    @property
+    def finished(self) -> bool:
+        """Whether all images have been seen."""
+        return self.images >= self.settings.images
+
+    def run(
+        self,
+        budget_s: float | None = None,
+        *,
+        log_every: int = 50,
+        check_every: int = 1000,
+        progress: bool = True,
+    ) -> None:
+        """Train until the run is finished or the time is up, then write a checkpoint and the weights.
+
+        Args:
+            budget_s: Wall-clock seconds, None for no limit.
+            log_every: Steps between rows of the curve.
+            check_every: Steps between measurements on the held-out scans, checkpoints and weights.
+            progress: Whether to show a progress bar on stderr.
+        """
+        from tqdm import tqdm
+
+        started = time.monotonic()
+        before = self._seconds
+        losses: list[torch.Tensor] = []
+        last = (self.images, started)
+        hidden = not progress or self._rank > 0
+        with tqdm(total=self.settings.images, initial=self.images, unit="image", disable=hidden) as bar:
+            while not self.finished and not self._out_of_time(started, budget_s):
+                was = self.images
+                losses.append(self.train_step())
+                bar.update(self.images - was)
+                self._seconds = before + time.monotonic() - started
+                check = self.step % check_every == 0
+                if self.step % log_every == 0 or check:
+                    means = torch.stack(losses).mean(0).tolist()
+                    losses.clear()
+                    now = time.monotonic()
+                    speed = (self.images - last[0]) / (now - last[1])
+                    last = (self.images, now)
+                    bar.set_postfix_str(f"{means[1]:.2f} nats, {speed:.0f} images/s")
+                    self._log(means, speed, self.measure() if check else {})
+                if check:
+                    self.save()
+        self.save()
+
+    def train_step(self) -> torch.Tensor:
+        """One update. -> (4,) total loss, rotation, translation, matches."""
+        settings = self.settings
+        rate = self.learning_rate()
+        for group in self._optimizer.param_groups:
+            group["lr"] = rate
+        # The same number of views on every process, so that none waits for another.
+        views = int(
+            np.random.default_rng([settings.seed, self.step]).integers(
+                settings.min_views, settings.max_views + 1
+            )
+        )
+        generator = np.random.default_rng([settings.seed, self.step, self._rank])
+        scans = max(1, settings.batch_images // views)
+        batch = make_batch(self._scans, scans, views, self.max_angle(), generator, settings.augmentation)
+        losses = self._losses(batch, generator)
+        self._optimizer.zero_grad()
+        torch.autograd.backward(self._scaler.scale(losses[0]))
+        self._scaler.unscale_(self._optimizer)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_norm)
+        self._scaler.step(self._optimizer)
+        self._scaler.update()
+        self.step += 1
+        seen = scans * views * self._processes
+        self.images += seen
+        # Young weights are forgotten sooner, or the average would keep the random ones.
+        keep = min(self.step / (self.step + 10), float(np.exp(-seen / settings.average_images)))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - keep)
+        return losses.detach()
+
+    def learning_rate(self) -> float:
+        """Of the coming step: a linear rise, a plateau, a linear fall to 0."""
+        s = self.settings
+        rise = min(1.0, (self.images + s.batch_images) / max(s.warmup_images, 1))
+        left = 1 - self.images / s.images
+        return s.learning_rate * rise * (min(1.0, left / s.decay) if s.decay > 0 else 1.0)
+
+    def max_angle(self) -> float:
+        """Largest angle between views and the one they surround, for the coming step, degrees."""
+        share = self.images / self.settings.images
+        return max(((start, angle) for start, angle in self.settings.curriculum if start <= share))[1]
+
+    def measure(self, views: int = 4, count: int = 32) -> dict[str, float]:
+        """Accuracy of single pairs on the held-out scans, by the averaged weights; empty without any."""
+        if self._held_out is None or self._rank > 0:
+            return {}
+        return pair_accuracy(self.average, self._held_out, views=views, count=count)
+
+    def save(self) -> None:
+        """Write checkpoint and averaged weights, by the first process alone."""
+        if self._rank == 0:
+            state = {
+                "network": self.network.state_dict(),
+                "average": self.average.state_dict(),
+                "optimizer": self._optimizer.state_dict(),
+                "scaler": self._scaler.state_dict(),
+                "step": self.step,
+                "images": self.images,
+                "seconds": self._seconds,
+                "preset": asdict(PRESETS[self.settings.preset]),
+            }
+            save_pieces(state, self.folder)
+            write_network(
+                self.average,
+                self.folder / WEIGHTS,
+                {
+                    "source": "relpose_ros train",
+                    "images_seen": str(self.images),
+                    "training": json.dumps(asdict(self.settings)),
+                },
+            )
+
+    def _resume(self) -> None:
+        state = load_pieces(self.folder)
+        # As JSON a tuple and a list are the same.
+        if json.dumps(state["preset"]) != json.dumps(asdict(PRESETS[self.settings.preset])):
+            text = (
+                f"the checkpoint in {self.folder} is of another network than '{self.settings.preset}'; "
+                "name another folder."
+            )
+            raise TrainingError(text)
+        self.network.load_state_dict(state["network"])
+        self.average.load_state_dict(state["average"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._scaler.load_state_dict(state["scaler"])
+        self.step, self.images, self._seconds = state["step"], state["images"], state["seconds"]
+        if self._rank == 0:
+            _cut_curve(self.folder / CURVE, self.step)
+
+    def _losses(self, batch: Batch, generator: np.random.Generator) -> torch.Tensor:
+        settings = self.settings
+        targets = make_targets(
+            batch,
+            settings.objective,
+            generator,
+            translation_frame=PRESETS[settings.preset].translation_frame,
+        )
+        precision = getattr(torch, settings.precision)
+        mixed = precision is not torch.float32
+        with torch.autocast(self._device.type, precision) if mixed else nullcontext():
+            losses: torch.Tensor = self._objective(
+                batch.images.to(self._device),
+                batch.crop_parameters.to(self._device),
+                _moved(targets, self._device),
+            )
+        return losses
+
+    def _out_of_time(self, started: float, budget_s: float | None) -> bool:
+        if budget_s is None:
+            return False
+        late = time.monotonic() - started > budget_s
+        if self._processes > 1:
+            # All stop at the same step, or those that go on would wait for ever.
+            flag = torch.tensor(float(late), device=self._device)
+            distributed.all_reduce(flag, distributed.ReduceOp.MAX)
+            late = bool(flag.item())
+        return late
+
+    def _log(self, means: Sequence[float], speed: float, accuracy: dict[str, float]) -> None:
+        if self._rank > 0:
+            return
+        path = self.folder / CURVE
+        row = {
+            "step": self.step,
+            "images": self.images,
+            "seconds": round(self._seconds, 1),
+            "images_per_second": round(speed, 1),
+            "learning_rate": f"{self.learning_rate():.3g}",
+            "max_angle": self.max_angle(),
+            **{name: round(value, 4) for name, value in zip(_LOSSES, means, strict=True)},
+            **{name: round(value, 4) for name, value in accuracy.items()},
+        }
+        columns = [*_COLUMNS, *_LOSSES, *ACCURACIES]
+        new = not path.exists()
+        with path.open("a", newline="", encoding="utf-8") as stream:
+            writer = csv.DictWriter(stream, columns)
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+
+
+BINS = ((0.0, 30.0), (30.0, 60.0), (60.0, 180.0))
+"""Degrees between the true orientations of two views, by which their accuracy is told."""
+ACCURACIES = (
+    "pair@15",
+    "pair@30",
+    "pair_median",
+    "identity@15",
+    *(f"pair@15_{low:g}-{high:g}" for low, high in BINS),
+)
+
+
+@torch.no_grad()
+def pair_accuracy(
+    network: RelPose, scans: Scans, *, views: int = 4, count: int = 32, level: int = 2
+) -> dict[str, float]:
+    """How often a pair's best rotation on a grid is right, for all pairs of scans drawn always alike.
+
+    Quick, and without the solver: to watch a run, not to compare methods with.
+
+    Args:
+        network: To measure.
+        scans: Held out.
+        views: Views a scan, drawn from all of them.
+        count: Scans.
+        level: Of the rotation grid: 2 has cells of 16 degrees, 3 of 8.
+
+    Returns:
+        Fractions by the keys of `ACCURACIES`, and the median error in degrees.
+    """
+    device = network.device
+    training = network.training
+    network.eval()
+    generator = np.random.default_rng(0)
+    rotations = np.array(so3_grid.grid(level))
+    embeddings = network.embed_relative(torch.from_numpy(rotations).float().to(device))
+    i, j = (index.tolist() for index in np.triu_indices(views, 1))
+    errors, angles = [], []
+    for _ in range(count):
+        batch = make_batch(scans, 1, views, 180.0, generator)
+        features = network.encode(batch.images.to(device), batch.crop_parameters.to(device))
+        energies = network.pair_energies(network.pair_contexts(features, i, j), embeddings)[0]
+        rotation = batch.camera_from_world[0, :, :, :3]
+        true = rotation[j] @ rotation[i].swapaxes(-1, -2)
+        errors.append(np.degrees(so3.angle_between(rotations[energies.argmax(-1).cpu().numpy()], true)))
+        angles.append(np.degrees(so3.angle_between(true, np.eye(3))))
+    network.train(training)
+    error, angle = np.concatenate(errors), np.concatenate(angles)
+    figures = {
+        "pair@15": float((error <= 15).mean()),
+        "pair@30": float((error <= 30).mean()),
+        "pair_median": float(np.median(error)),
+        "identity@15": float((angle <= 15).mean()),
+    }
+    for low, high in BINS:
+        inside = (angle >= low) & (angle < high)
+        correct = float((error[inside] <= 15).mean()) if inside.any() else float("nan")
+        figures[f"pair@15_{low:g}-{high:g}"] = correct
+    return figures
+
+
+def save_pieces(state: State, folder: Path, piece_bytes: int = PIECE_BYTES) -> None:
+    """Write a checkpoint as files of limited size; the listing, written last, makes it the current one."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    content = buffer.getvalue()
+    digest = hashlib.sha256(content).hexdigest()
+    names = []
+    for number, start in enumerate(range(0, len(content), piece_bytes)):
+        names.append(f"checkpoint-{digest[:12]}.{number:03d}")
+        (folder / names[-1]).write_bytes(content[start : start + piece_bytes])
+    listing = folder / "checkpoint.json"
+    partial = listing.with_suffix(".partial")
+    partial.write_text(json.dumps({"pieces": names, "sha256": digest}) + "\n", encoding="utf-8")
+    os.replace(partial, listing)  # noqa: PTH105 - a rename within one folder is all or nothing
+    for old in folder.glob("checkpoint-*.[0-9][0-9][0-9]"):
+        if old.name not in names:
+            old.unlink()
+
+
+def load_pieces(folder: Path) -> State:
+    """Read what `save_pieces` wrote.
+
+    Raises:
+        TrainingError: A piece is missing or damaged.
+    """
+    try:
+        listing = json.loads((folder / "checkpoint.json").read_text(encoding="utf-8"))
+        content = b"".join((folder / name).read_bytes() for name in listing["pieces"])
+    except (OSError, ValueError, KeyError) as err:
+        text = f"the checkpoint in {folder} cannot be read: {err}."
+        raise TrainingError(text) from err
+    if hashlib.sha256(content).hexdigest() != listing["sha256"]:
+        text = f"the checkpoint in {folder} is damaged: its pieces do not have the digest in checkpoint.json."
+        raise TrainingError(text)
+    state: State = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    return state
+
+
+def _join(device: torch.device) -> tuple[int, int]:
+    """Rank and number of processes; joins those that torchrun started."""
+    processes = int(os.environ.get("WORLD_SIZE", "1"))
+    if processes > 1 and not distributed.is_initialized():
+        distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    return (distributed.get_rank(), processes) if processes > 1 else (0, 1)
+
+
+def _moved(targets: Targets, device: torch.device) -> Targets:
+    tensors = {
+        name: value.to(device) for name, value in vars(targets).items() if isinstance(value, torch.Tensor)
+    }
+    return replace(targets, **tensors)
+
+
+def _cut_curve(path: Path, step: int) -> None:
+    """Forget what was logged after the checkpoint: those steps are taken again."""
+    if path.exists():
+        with path.open(newline="", encoding="utf-8") as stream:
+            header, *rows = list(csv.reader(stream))
+        with path.open("w", newline="", encoding="utf-8") as stream:
+            csv.writer(stream).writerows([header, *(row for row in rows if int(row[0]) <= step)])
