@@ -8,7 +8,7 @@ names, and ``backgrounds/manifest.csv`` (columns name, file, kind) with panorama
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,12 +57,12 @@ class Assets:
     surfaces: tuple[Path, ...]
     """Photographed materials."""
     patterns: tuple[Path, ...]
-    only_textured: bool = field(default=False)
-    """Whether meshes always keep their own texture (the held-out objects, which are measured on)."""
+    unchanged: bool = False
+    """Whether its meshes are all that is scanned, and as they are: held-out objects are measured on."""
 
     def random_object(self, rng: np.random.Generator) -> SyntheticObject:
         """A mesh of this split, sometimes under another texture."""
-        if self.bare and not self.only_textured and rng.random() > TEXTURED_SHARE:
+        if self.bare and not self.unchanged and rng.random() > TEXTURED_SHARE:
             entry = self.bare[int(rng.integers(len(self.bare)))]
             mesh, _ = read_mesh(entry.file)
             return SyntheticObject((Part(mesh, self.random_surface(rng), *_finish(rng)),), name=entry.name)
@@ -74,7 +74,7 @@ class Assets:
         mesh, picture = read_mesh(entry.file)
         if picture is None:
             picture = self.random_surface(rng)
-        elif not self.only_textured:
+        elif not self.unchanged:
             gain = np.exp(rng.normal(0, 0.12, 3) + rng.normal(0, 0.15))
             table = np.clip(np.arange(256)[:, None] * gain, 0, 255).astype(np.uint8)
             picture = np.asarray(cv2.LUT(picture, table[None]), np.uint8)
@@ -138,7 +138,7 @@ def load_assets(folder: Path, split: str = "train") -> Assets:
         panoramas=tuple(folder / "backgrounds" / p["file"] for p in pictures if p["kind"].startswith("hdri")),
         surfaces=tuple(folder / "backgrounds" / p["file"] for p in pictures if p["kind"] == "surface"),
         patterns=tuple(folder / "backgrounds" / p["file"] for p in pictures if p["kind"] == "pattern"),
-        only_textured=split == "held_out",
+        unchanged=split != "train",
     )
 
 

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from relpose_ros.captures.assets import Assets
     from relpose_ros.captures.textures import Image
 
-    Build = Callable[[np.random.Generator], "SyntheticObject"]
+    Paint = Callable[[np.random.Generator], Image]
+    Build = Callable[[np.random.Generator, Paint], "SyntheticObject"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +68,17 @@ class SyntheticObject:
 
 
 def random_object(rng: np.random.Generator, assets: Assets | None = None) -> SyntheticObject:
-    """Any kind of thing, as common as seems useful for learning; half of them meshes with assets."""
+    """Any kind of thing, as common as seems useful for learning; half of them meshes with assets.
+
+    Assets that are to stay unchanged are all there is.
+    """
+    if assets is not None and assets.unchanged:
+        return assets.random_object(rng).normalised()
     if assets is not None and rng.random() < 0.5:
         thing = assets.random_object(rng)
     else:
         build, _ = _KINDS[int(rng.choice(len(_KINDS), p=_SHARES))]
-        thing = build(rng)
+        thing = build(rng, textures.surface if assets is None else assets.random_surface)
     if rng.random() < 0.3:
         stretch = np.exp(rng.normal(0, 0.2, 3))
         if thing.symmetry.kind is not SymmetryKind.NONE:
@@ -81,16 +87,18 @@ def random_object(rng: np.random.Generator, assets: Assets | None = None) -> Syn
     return thing.normalised()
 
 
-def _material(rng: np.random.Generator, mesh: Mesh, texture: Image | None = None) -> Part:
-    """A part with a random material; plain ones are less common than on real things, being hard."""
-    if texture is None:
-        texture = textures.surface(rng, contrast=0.05) if rng.random() < 0.15 else textures.surface(rng)
+def _painted(rng: np.random.Generator, mesh: Mesh, paint: Paint) -> Part:
+    """A part as ``paint`` draws it; plain ones are less common than on real things, being hard."""
+    return _finished(rng, mesh, textures.surface(rng, contrast=0.05) if rng.random() < 0.12 else paint(rng))
+
+
+def _finished(rng: np.random.Generator, mesh: Mesh, texture: Image) -> Part:
     gloss = 0.0 if rng.random() < 0.55 else rng.uniform(0.05, 0.8)
     relief = 0.0 if rng.random() < 0.5 else rng.uniform(0, 0.02)
     return Part(mesh, texture, gloss=float(gloss), relief=float(relief))
 
 
-def package(rng: np.random.Generator) -> SyntheticObject:
+def package(rng: np.random.Generator, paint: Paint) -> SyntheticObject:
     """A printed box with different faces, sometimes with a lid or a second one on it."""
     extents = rng.uniform(0.25, 1.0, 3)
     atlas = np.zeros((256, 384, 3), np.uint8)
@@ -102,10 +110,10 @@ def package(rng: np.random.Generator) -> SyntheticObject:
                 # One design: the faces share a ground.
                 face = np.where(rng.random() < 0.5, face // 2 + scheme // 2, face)
             atlas[128 * row : 128 * row + 128, 128 * column : 128 * column + 128] = face
-    parts = [_material(rng, shapes.box(extents, atlas=True), _square(atlas))]
+    parts = [_finished(rng, shapes.box(extents, atlas=True), _square(atlas))]
     if rng.random() < 0.25:
         lid = shapes.box(extents * (1.03, 1.03, rng.uniform(0.1, 0.3))).moved((0, 0, extents[2] * 0.45))
-        parts.append(_material(rng, lid))
+        parts.append(_painted(rng, lid, paint))
     return SyntheticObject(tuple(parts), name="package")
 
 
@@ -115,7 +123,7 @@ def _square(image: Image, size: int = 256) -> Image:
     return np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def bottle(rng: np.random.Generator) -> SyntheticObject:
+def bottle(rng: np.random.Generator, paint: Paint) -> SyntheticObject:
     """Bottle, can, jar or vase: a lathe with a label around it; without the label it is symmetric."""
     height = rng.uniform(0.8, 3.0)
     neck = rng.uniform(0.25, 1.0)
@@ -141,25 +149,25 @@ def bottle(rng: np.random.Generator) -> SyntheticObject:
     if plain:
         rings = textures.surface(rng)[:, :1].repeat(256, 1)
         return SyntheticObject(
-            (_material(rng, body, np.ascontiguousarray(rings)),),
+            (_finished(rng, body, np.ascontiguousarray(rings)),),
             Symmetry(SymmetryKind.CONTINUOUS, (0.0, 0.0, 1.0), 0),
             "lathe",
         )
     parts = [
-        _material(
-            rng, body, textures.surface(rng) if rng.random() < 0.6 else _square(textures.label(rng, 128, 256))
-        )
+        _finished(rng, body, paint(rng) if rng.random() < 0.6 else _square(textures.label(rng, 128, 256)))
     ]
     low, high = np.sort(rng.uniform(0.1, 0.7, 2)) * height
     if high - low > 0.15 * height:
         wall = shapes.lathe([(1.012, low), (1.012, high)])
-        parts.append(_material(rng, wall, _square(textures.label(rng, 256, 512))))
+        parts.append(_finished(rng, wall, _square(textures.label(rng, 256, 512))))
     if rng.random() < 0.6:
         cap = rng.uniform(0.9, 1.3) * neck
         top = height + rng.uniform(0.02, 0.3)
-        parts.append(_material(rng, shapes.lathe([(cap, height - 0.12), (cap, top), (0, top)], sectors=24)))
+        parts.append(
+            _painted(rng, shapes.lathe([(cap, height - 0.12), (cap, top), (0, top)], sectors=24), paint)
+        )
     if rng.random() < 0.15:
-        parts.append(_material(rng, _handle(rng, 0.95, 0.2 * height, 0.8 * height)))
+        parts.append(_painted(rng, _handle(rng, 0.95, 0.2 * height, 0.8 * height), paint))
     squash = np.diag([1.0, rng.uniform(0.4, 1.0) if rng.random() < 0.35 else 1.0, 1.0])
     return SyntheticObject(tuple(parts), name="bottle").transformed(squash)
 
@@ -178,7 +186,7 @@ def _handle(rng: np.random.Generator, radius: float, low: float, high: float) ->
     return shapes.tube(shapes.smooth_path(points, 16), thick, sides=10, flattening=rng.uniform(0.8, 1.8))
 
 
-def mug(rng: np.random.Generator) -> SyntheticObject:
+def mug(rng: np.random.Generator, paint: Paint) -> SyntheticObject:
     """An open vessel: mug, cup, bowl, pot, teapot; the handle is what tells its sides apart."""
     height, flare = rng.uniform(0.7, 2.4), rng.uniform(0.65, 1.3)
     wall = rng.uniform(0.06, 0.14)
@@ -188,16 +196,16 @@ def mug(rng: np.random.Generator) -> SyntheticObject:
     inside = outside[::-1] - wall
     profile = [(0, 0), (0.85, 0), *zip(outside, t * height, strict=True)]
     profile += [*zip(inside[:-1], t[::-1][:-1] * height, strict=True), (inside[-1], wall), (0, wall)]
-    ground = textures.surface(rng, contrast=rng.uniform(0.05, 1))
-    body = _material(rng, shapes.lathe(profile, sectors=40), ground)
+    ground = paint(rng) if rng.random() < 0.6 else textures.surface(rng, contrast=rng.uniform(0.05, 0.4))
+    body = _finished(rng, shapes.lathe(profile, sectors=40), ground)
     parts = [body]
     if rng.random() < 0.5:
         t0, t1 = 0.2, rng.uniform(0.5, 0.9)
         band = [(np.interp(s, t, outside) + 0.01, s * height) for s in np.linspace(t0, t1, 6)]
-        parts.append(_material(rng, shapes.lathe(band, sectors=40), _square(textures.label(rng, 256, 512))))
+        parts.append(_finished(rng, shapes.lathe(band, sectors=40), _square(textures.label(rng, 256, 512))))
     if rng.random() < 0.85:
         ear = _handle(rng, float(np.interp(0.5, t, outside)), 0.2 * height, 0.85 * height)
-        parts.append(replace(body, mesh=ear) if rng.random() < 0.6 else _material(rng, ear))
+        parts.append(replace(body, mesh=ear) if rng.random() < 0.6 else _painted(rng, ear, paint))
     if rng.random() < 0.3:
         spout = [
             (-0.8, 0, 0.35 * height),
@@ -215,19 +223,19 @@ def mug(rng: np.random.Generator) -> SyntheticObject:
             (0.18, height * 1.3),
             (0, height * 1.33),
         ]
-        parts.append(_material(rng, shapes.lathe(lid)))
+        parts.append(_painted(rng, shapes.lathe(lid), paint))
     return SyntheticObject(tuple(parts), name="mug")
 
 
-def statue(rng: np.random.Generator) -> SyntheticObject:
+def statue(rng: np.random.Generator, paint: Paint) -> SyntheticObject:
     """One material, much relief: busts, animals, stones, figures on a base."""
-    texture = textures.coloured(
-        textures.pattern(12 * int(rng.integers(40)) + int(rng.integers(3))),
-        textures.palette(rng, contrast=rng.uniform(0.1, 0.5)),
-    )
+    stone = textures.pattern(12 * int(rng.integers(40)) + int(rng.integers(3)))
+    texture = textures.coloured(stone, textures.palette(rng, contrast=rng.uniform(0.1, 0.5)))
+    if rng.random() < 0.4:
+        texture = textures.worn(paint(rng), rng)
     relief, gloss = float(rng.uniform(0, 0.03)), float(rng.uniform(0, 0.3))
     blobs = []
-    reach = rng.uniform(0.4, 0.9)
+    reach = rng.uniform(0.3, 0.7)
     for k in range(int(rng.integers(1, 7))):
         body = shapes.superquadric(*rng.uniform(0.5, 1.4, 2), rings=24, sectors=36)
         body = shapes.displaced(body, rng, rng.uniform(0.03, 0.2), finest=rng.uniform(4, 14))
@@ -246,11 +254,11 @@ def statue(rng: np.random.Generator) -> SyntheticObject:
     if rng.random() < 0.4:
         low = min(float(blob.positions[:, 2].min()) for blob in blobs)
         extents = (*rng.uniform(0.8, 1.8, 2), rng.uniform(0.2, 1.0))
-        parts.append(_material(rng, shapes.box(extents).moved((0, 0, low - extents[2] / 2 + 0.1))))
+        parts.append(_painted(rng, shapes.box(extents).moved((0, 0, low - extents[2] / 2 + 0.1)), paint))
     return SyntheticObject(tuple(parts), name="statue")
 
 
-def tool(rng: np.random.Generator) -> SyntheticObject:
+def tool(rng: np.random.Generator, paint: Paint) -> SyntheticObject:
     """A long handle with a head: hammer, brush, torch, axe; lying down."""
     path = shapes.smooth_path(
         [
@@ -262,14 +270,15 @@ def tool(rng: np.random.Generator) -> SyntheticObject:
         20,
     )
     radii = np.interp(np.linspace(0, 1, 20), np.linspace(0, 1, 5), rng.uniform(0.1, 0.28, 5))
-    parts = [_material(rng, shapes.tube(path, radii, sides=14, flattening=rng.uniform(0.5, 1.3)))]
+    parts = [_painted(rng, shapes.tube(path, radii, sides=14, flattening=rng.uniform(0.5, 1.3)), paint)]
     for _ in range(int(rng.integers(1, 4))):
         parts.append(
-            _material(
+            _painted(
                 rng,
                 _primitive(rng)
                 .scaled(rng.uniform(0.15, 0.6, 3))
                 .moved((2.4 + rng.normal(0, 0.25), *rng.normal(0, 0.12, 2))),
+                paint,
             )
         )
     if rng.random() < 0.5:
@@ -277,21 +286,23 @@ def tool(rng: np.random.Generator) -> SyntheticObject:
         ring = shapes.lathe([(0.3, -0.1), (0.32, 0), (0.3, 0.1)], sectors=20).transformed(
             np.eye(3)[[2, 0, 1]], (place, 0, 0)
         )
-        parts.append(_material(rng, ring))
+        parts.append(_painted(rng, ring, paint))
     return SyntheticObject(tuple(parts), name="tool")
 
 
-def toy(rng: np.random.Generator) -> SyntheticObject:
+def toy(rng: np.random.Generator, paint: Paint) -> SyntheticObject:
     """A body on wheels or legs with a cabin or head and small parts that break its symmetry."""
     length, width, height = rng.uniform(1.4, 2.6), rng.uniform(0.6, 1.2), rng.uniform(0.4, 0.9)
     body = shapes.superquadric(*rng.uniform(0.15, 0.9, 2)) if rng.random() < 0.6 else shapes.box((2, 2, 2))
-    parts = [_material(rng, body.scaled((length / 2, width / 2, height / 2)))]
+    parts = [_painted(rng, body.scaled((length / 2, width / 2, height / 2)), paint)]
     top = shapes.superquadric(*rng.uniform(0.2, 1, 2)).scaled(rng.uniform(0.25, 0.6, 3))
     parts.append(
-        _material(rng, top.moved((rng.uniform(-0.4, 0.5) * length, 0, height / 2 + rng.uniform(0, 0.3))))
+        _painted(
+            rng, top.moved((rng.uniform(-0.4, 0.5) * length, 0, height / 2 + rng.uniform(0, 0.3))), paint
+        )
     )
-    wheel = _material(rng, shapes.lathe([(0, -0.1), (0.3, -0.1), (0.3, 0.1), (0, 0.1)], sectors=20))
-    leg = _material(rng, shapes.lathe([(0, -0.5), (0.14, -0.5), (0.12, 0.5), (0, 0.5)], sectors=12))
+    wheel = _painted(rng, shapes.lathe([(0, -0.1), (0.3, -0.1), (0.3, 0.1), (0, 0.1)], sectors=20), paint)
+    leg = _painted(rng, shapes.lathe([(0, -0.5), (0.14, -0.5), (0.12, 0.5), (0, 0.5)], sectors=12), paint)
     rolling = rng.random() < 0.6
     for x in (-0.32, 0.32):
         for side in (-1, 1):
@@ -300,14 +311,16 @@ def toy(rng: np.random.Generator) -> SyntheticObject:
             parts.append(replace(wheel if rolling else leg, mesh=mesh))
     for _ in range(int(rng.integers(0, 4))):
         small = _primitive(rng).scaled(rng.uniform(0.06, 0.25, 3))
-        parts.append(_material(rng, small.moved(rng.uniform(-0.5, 0.5, 3) * (length, width, height + 0.4))))
+        parts.append(
+            _painted(rng, small.moved(rng.uniform(-0.5, 0.5, 3) * (length, width, height + 0.4)), paint)
+        )
     return SyntheticObject(tuple(parts), name="toy")
 
 
-def furniture(rng: np.random.Generator) -> SyntheticObject:
+def furniture(rng: np.random.Generator, paint: Paint) -> SyntheticObject:
     """Chair, stool, table, shelf, lamp: boards and bars."""
-    wood = _material(rng, shapes.box())
-    other = _material(rng, shapes.box())
+    wood = _painted(rng, shapes.box(), paint)
+    other = _painted(rng, shapes.box(), paint)
     width, depth, seat = rng.uniform(0.7, 1.6), rng.uniform(0.7, 1.3), rng.uniform(0.4, 1.2)
     bars: list[Part] = [
         replace(other, mesh=shapes.box((width, depth, rng.uniform(0.06, 0.25))).moved((0, 0, seat)))
@@ -322,15 +335,17 @@ def furniture(rng: np.random.Generator) -> SyntheticObject:
         bars.append(replace(other if rng.random() < 0.6 else wood, mesh=back))
     if rng.random() < 0.5:
         bars.append(
-            _material(
-                rng, shapes.box((width * 0.9, depth * 0.9, 0.06)).moved((0, 0, seat * rng.uniform(0.3, 0.7)))
+            _painted(
+                rng,
+                shapes.box((width * 0.9, depth * 0.9, 0.06)).moved((0, 0, seat * rng.uniform(0.3, 0.7))),
+                paint,
             )
         )
     for _ in range(int(rng.integers(0, 4))):
         mesh = (
             _primitive(rng).scaled(rng.uniform(0.1, 0.3, 3)).moved((*rng.uniform(-0.3, 0.3, 2), seat + 0.25))
         )
-        bars.append(_material(rng, mesh))
+        bars.append(_painted(rng, mesh, paint))
     return SyntheticObject(tuple(bars), name="furniture")
 
 
@@ -357,29 +372,28 @@ def _primitive(rng: np.random.Generator) -> Mesh:
     return shapes.displaced(shapes.superquadric(1, 1), rng, rng.uniform(0.1, 0.25), finest=6)
 
 
-def heap(rng: np.random.Generator) -> SyntheticObject:
+def heap(rng: np.random.Generator, paint: Paint) -> SyntheticObject:
     """Primitives grown together at random."""
     parts = []
-    spread = rng.uniform(0.25, 0.6)
+    spread = rng.uniform(0.15, 0.42)
     for k in range(int(rng.integers(2, 8))):
         size = rng.uniform(0.15, 0.6, 3) * (1.4 if k == 0 else 0.8)
         turn = so3.random_rotations(1, rng)[0] if rng.random() < 0.5 else np.eye(3)
         parts.append(
-            _material(
-                rng, _primitive(rng).transformed(turn @ np.diag(size), rng.normal(0, spread, 3) * (k > 0))
+            _painted(
+                rng,
+                _primitive(rng).transformed(turn @ np.diag(size), rng.normal(0, spread, 3) * (k > 0)),
+                paint,
             )
         )
     return SyntheticObject(tuple(parts), name="heap")
 
 
-def solid(rng: np.random.Generator) -> SyntheticObject:
-    """One primitive under one strong texture."""
-    part = _material(
-        rng,
-        _primitive(rng).scaled(rng.uniform(0.4, 1, 3)),
-        textures.surface(rng, contrast=rng.uniform(0.4, 1)),
+def solid(rng: np.random.Generator, paint: Paint) -> SyntheticObject:
+    """One primitive under one texture."""
+    return SyntheticObject(
+        (_finished(rng, _primitive(rng).scaled(rng.uniform(0.4, 1, 3)), paint(rng)),), name="solid"
     )
-    return SyntheticObject((part,), name="solid")
 
 
 _KINDS: Sequence[tuple[Build, float]] = (

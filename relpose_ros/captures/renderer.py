@@ -381,7 +381,8 @@ class Renderer:
         _set(program, "camera", tuple(-camera_from_world[:, :3].T @ camera_from_world[:, 3]))
         # The seam of the panorama would upset the driver's own choice of level.
         texels = around.panorama.shape[1] * window.width / width / k.fx / (2 * np.pi)
-        _set(program, "level", float(max(np.log2(max(texels, 1.0)) + sharpness, 0.0)))
+        level = np.log2(max(texels, 1.0)) + sharpness + around.backdrop_blur
+        _set(program, "level", float(max(level, 0.0)))
         self._everywhere.render(vertices=3)
 
     def _places(

@@ -101,6 +101,8 @@ class Surroundings:
     """(3,) half extents of the box around the origin onto which the panorama is projected."""
     eye: FloatArray
     """(3,) where in that box the panorama was taken."""
+    backdrop_blur: float = 0.0
+    """Defocus of the panorama, in halvings of its resolution; the light it gives is not affected."""
     ground: Part | None = None
     """What the object stands on; None where it floats."""
     ground_turns: bool = False
@@ -314,6 +316,7 @@ def _surroundings(
         panorama=panorama,
         room_half=half,
         eye=eye,
+        backdrop_blur=float(rng.uniform(0, 3)) if rng.random() < 0.5 else 0.0,
         ground=ground,
         ground_turns=turns,
         ground_z=-1e3 if ground_z is None else ground_z,

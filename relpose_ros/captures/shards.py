@@ -5,6 +5,7 @@ A shard is a folder of .npy files with one row per scan, all of them memory-mapp
     images.npy              (M, N, S, S, 3) uint8, RGB crops
     places.npy              (M, N, S/8, S/8, 3) float16, object coordinates seen at the cells' centres,
                             NaN off the object
+    masks.npy               (M, N, S, S/8) uint8, a bit per pixel (numpy.packbits), set on the object
     crop_parameters.npy     (M, N, 3) float32, as the network takes them
     camera_from_object.npy  (M, N, 3, 4) float32, optical; unit: the object's bounding radius
     intrinsics.npy          (M, N, 4) float32, fx, fy, cx, cy of the full image, pixels
@@ -103,6 +104,7 @@ def _write_shard(folder: Path, plan: ShardPlan, number: int) -> None:
     arrays: dict[str, npt.NDArray[Any]] = {
         "images": np.empty((m, n, s, s, 3), np.uint8),
         "places": np.empty((m, n, cells, cells, 3), np.float16),
+        "masks": np.empty((m, n, s, s // 8), np.uint8),
         "crop_parameters": np.empty((m, n, 3), np.float32),
         "camera_from_object": np.empty((m, n, 3, 4), np.float32),
         "intrinsics": np.empty((m, n, 4), np.float32),
@@ -132,6 +134,7 @@ def _fill(arrays: dict[str, npt.NDArray[Any]], row: int, scan: RenderedScan) -> 
         "complete",
     ):
         arrays[name][row] = getattr(scan, name)
+    arrays["masks"][row] = np.packbits(scan.coverage >= 128, axis=-1)
     axis = (np.nan,) * 3 if scan.symmetry.axis is None else scan.symmetry.axis
     arrays["symmetry"][row] = (int(scan.symmetry.kind), scan.symmetry.order, *axis)
     arrays["motion"][row] = list(Motion).index(scan.motion)
