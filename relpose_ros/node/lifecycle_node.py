@@ -1,0 +1,510 @@
+"""The lifecycle node around a scanner: topics and services in, estimates out. It decides nothing by itself.
+
+Callbacks hand messages to the scanner and return; estimates are made and published by one worker thread.
+"""
+
+# rclpy is annotated in part only.
+# mypy: disable-error-code="no-untyped-call"
+
+from __future__ import annotations
+
+import functools
+import threading
+import time
+import traceback
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
+from copy import copy
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseArray
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, JumpThreshold
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import Marker, MarkerArray
+
+from relpose_ros.errors import RelPoseError
+from relpose_ros.msg import ObjectView, ScanEstimate
+from relpose_ros.node.parameters import changed_settings, declare_parameters
+from relpose_ros.node.reports import Throttle, diagnostic_status, qos_advice
+from relpose_ros.scanning.scanner import Scanner
+from relpose_ros.scanning.settings import SettingsError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from rclpy.parameter import Parameter
+
+    from relpose_ros.scanning.scanner import Kind, Result, SupportsEstimate
+
+    Transition: TypeAlias = Callable[["ScanNode", LifecycleState], TransitionCallbackReturn]
+
+BURST = 50
+"""Messages that a subscription keeps while the callbacks are busy with others."""
+
+INPUTS: tuple[tuple[Kind, str, Any, str], ...] = (
+    ("object_view", "object_view", ObjectView, ""),
+    ("image", "image", Image, "raw"),
+    ("compressed", "image/compressed", CompressedImage, "compressed"),
+)
+"""Kind, topic, type, and the image transport that must be asked for (empty: always there)."""
+
+OUTPUTS: tuple[tuple[str, Any], ...] = (
+    ("~/estimate", ScanEstimate),
+    ("~/poses", PoseArray),
+    ("~/markers", MarkerArray),
+)
+
+IMAGE_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=BURST,
+    reliability=ReliabilityPolicy.BEST_EFFORT,  # matches every publisher
+    durability=DurabilityPolicy.VOLATILE,
+)
+RESULT_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,  # with transient local: matches every subscription
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+DIAGNOSTICS_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10)
+OVERRIDABLE = QoSOverridingOptions(
+    (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
+)
+
+
+def _guarded(transition: Transition) -> Transition:
+    """A transition that excludes the others and tells what went wrong: rclpy would swallow the exception."""
+
+    @functools.wraps(transition)
+    def run(node: ScanNode, state: LifecycleState) -> TransitionCallbackReturn:
+        with node.in_transition:
+            try:
+                return transition(node, state)
+            except Exception:
+                node.get_logger().error(f"{transition.__name__} failed:\n{traceback.format_exc()}")
+                return TransitionCallbackReturn.ERROR
+
+    return run
+
+
+class ScanNode(LifecycleNode):
+    """Views of objects in, camera poses out.
+
+    Topics, services and parameters are those of the README. Configuring loads the weights and makes every
+    topic and service; until the node is active, messages are passed over and services answer with a refusal.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        """Declare the parameters.
+
+        Raises:
+            SettingsError: A parameter was given a value that it cannot have.
+        """
+        # rclpy reads the transition callbacks in its constructor, so this has to exist before.
+        self.in_transition = threading.RLock()
+        super().__init__("scan_node", **kwargs)
+        self._settings = declare_parameters(self)
+        self._scanner: Scanner | None = None
+        self._worker: ThreadPoolExecutor | None = None
+        self._jobs: set[Future[Any]] = set()
+        self._jobs_lock = threading.Lock()
+        self._estimate_asked = False
+        self._active = False
+        self._closing = False
+        self._failure = ""
+        self._inputs: list[Any] = []
+        self._services_of_scan: list[Any] = []
+        self._outputs: dict[str, Any] = {}
+        self._jump: Any = None
+        self._incompatible: dict[str, tuple[bool, str]] = {}
+        self._longest_callback_s: dict[str, float] = {}
+        self._publishers_of: dict[str, int] = {}
+        self._throttle = Throttle()
+        # A service that waits for an estimate must not hold up the callbacks of images.
+        self._waiting_group = MutuallyExclusiveCallbackGroup()
+        self._diagnostics = self.create_publisher(
+            DiagnosticArray, "/diagnostics", copy(DIAGNOSTICS_QOS), qos_overriding_options=OVERRIDABLE
+        )
+        self._diagnostics_timer: Any = None
+        self._set_diagnostics_timer()
+        change_state = self._service_change_state
+        change_state.callback = functools.partial(self._on_change_state, change_state.callback)
+        self.add_on_set_parameters_callback(self._judge_parameters)
+        self.add_post_set_parameters_callback(self._take_parameters)
+
+    def autostart(self) -> None:
+        """Configure and activate, where the parameter says so."""
+        if self._settings.autostart and self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    def close(self, timeout_s: float) -> bool:
+        """Begin nothing more, and wait for what is under way.
+
+        Returns:
+            Whether nothing is under way any more; False where the time was too short.
+        """
+        self._closing = True
+        self._active = False
+        deadline = time.monotonic() + timeout_s
+        if not self.in_transition.acquire(timeout=timeout_s):
+            return False
+        try:
+            if self._worker is not None:
+                self._worker.shutdown(wait=False, cancel_futures=True)
+            return not wait(self._jobs, max(0.0, deadline - time.monotonic())).not_done
+        finally:
+            self.in_transition.release()
+
+    def finalize(self) -> None:
+        """Take the lifecycle to its end, wherever it stands."""
+        if self._state_machine.current_state[1] != "finalized":
+            self.trigger_shutdown()
+
+    # rclpy calls the transitions.
+
+    @_guarded
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load the weights; make topics, services and the worker."""
+        self._failure = ""
+        try:
+            estimator = self._load_estimator()
+        except (RelPoseError, OSError) as err:
+            self._failure = str(err)
+            self.get_logger().error(f"{err} Set the parameter weights and configure the node again.")
+            return TransitionCallbackReturn.FAILURE
+        if self._closing:
+            return TransitionCallbackReturn.FAILURE
+        self._scanner = Scanner(estimator, self._settings)
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="estimate")
+        self._make_outputs()
+        self._make_inputs(self._scanner)
+        for name, callback, group in (
+            ("~/reset", self._on_reset, None),
+            ("~/drop_last_view", self._on_drop_last_view, None),
+            ("~/estimate_now", self._on_estimate_now, self._waiting_group),
+        ):
+            service = self.create_service(Trigger, name, callback, callback_group=group)
+            self._services_of_scan.append(service)
+        threshold = JumpThreshold(
+            min_forward=None,
+            min_backward=Duration(seconds=-self._settings.backward_jump_s),
+            on_clock_change=False,
+        )
+        self._jump = self.get_clock().create_jump_callback(threshold, post_callback=self._on_clock_jump)
+        return super().on_configure(state)
+
+    @_guarded
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take messages and answer services from now on."""
+        result = super().on_activate(state)
+        self._active = True
+        self._ask_for_estimate()
+        topics = ", ".join(each.topic_name for each in self._inputs)
+        self.get_logger().info(f"Waiting for views on {topics}.")
+        return result
+
+    @_guarded
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take nothing more; the views taken so far still get their estimate. They stay held."""
+        self._active = False
+        wait(self._jobs)
+        return super().on_deactivate(state)
+
+    @_guarded
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Release everything that configuring made."""
+        self._release()
+        return super().on_cleanup(state)
+
+    @_guarded
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Release everything that configuring made."""
+        self._release()
+        return super().on_shutdown(state)
+
+    @_guarded
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Release everything, so that the node can be configured again."""
+        self._release()
+        return super().on_error(state)
+
+    # What configuring makes.
+
+    def _load_estimator(self) -> SupportsEstimate:
+        # Imported here, as is all that needs PyTorch: that takes seconds, in which a signal must be heard.
+        from relpose_ros.inference.estimator import Estimator
+
+        weights, threads = self._settings.weights, self._settings.threads
+        self.get_logger().info(f"Loading {weights or 'the shipped weights'}.")
+        return Estimator.from_weights(Path(weights) if weights else None, threads or None)
+
+    def _make_outputs(self) -> None:
+        for name, message_type in OUTPUTS:
+            topic = self.resolve_topic_name(name)
+            events = PublisherEventCallbacks(
+                incompatible_qos=functools.partial(self._on_incompatible_qos, topic, False)
+            )
+            self._outputs[name] = self.create_lifecycle_publisher(
+                message_type,
+                name,
+                copy(RESULT_QOS),  # rclpy writes the overrides into the profile
+                event_callbacks=events,
+                qos_overriding_options=OVERRIDABLE,
+            )
+
+    def _make_inputs(self, scanner: Scanner) -> None:
+        transports = self._settings.image_transports
+        wanted = [each[:3] for each in INPUTS if not each[3] or each[3] in transports]
+        for kind, name, message_type in [*wanted, ("camera_info", "camera_info", CameraInfo)]:
+            topic = self.resolve_topic_name(name)
+            events = SubscriptionEventCallbacks(
+                incompatible_qos=functools.partial(self._on_incompatible_qos, topic, True),
+                matched=functools.partial(self._on_matched, topic),
+            )
+            self._publishers_of[topic] = 0
+            subscription = self.create_subscription(
+                message_type,
+                name,
+                functools.partial(self._on_message, scanner, kind, topic),
+                copy(IMAGE_QOS),
+                event_callbacks=events,
+                qos_overriding_options=OVERRIDABLE,
+            )
+            self._inputs.append(subscription)
+
+    def _release(self) -> None:
+        self._active = False
+        if self._worker is not None:
+            self._worker.shutdown(wait=True, cancel_futures=True)
+        if self._jump is not None:
+            self._jump.unregister()
+        for subscription in self._inputs:
+            self.destroy_subscription(subscription)
+        for service in self._services_of_scan:
+            self.destroy_service(service)
+        for publisher in self._outputs.values():
+            self.destroy_lifecycle_publisher(publisher)
+        self._inputs, self._services_of_scan, self._outputs = [], [], {}
+        self._worker = self._scanner = self._jump = None
+        self._estimate_asked = False
+        self._incompatible.clear()
+        self._longest_callback_s.clear()
+        self._publishers_of.clear()
+
+    # Messages in.
+
+    def _on_message(self, scanner: Scanner, kind: Kind, topic: str, message: Any) -> None:
+        if not self._active:
+            return
+        started = time.perf_counter()
+        receipt = scanner.receive(kind, topic, message)
+        if receipt.accepted:
+            self._ask_for_estimate()
+        if receipt.rejected:
+            line = self._throttle.pass_on(topic, receipt.reason)
+            if line is not None:
+                self.get_logger().warning(line)
+        elif receipt.reason:
+            self.get_logger().debug(receipt.reason)
+        spent = time.perf_counter() - started
+        self._longest_callback_s[topic] = max(spent, self._longest_callback_s.get(topic, 0.0))
+
+    def _on_clock_jump(self, jump: Any) -> None:
+        scanner = self._scanner
+        if scanner is not None:
+            scanner.reset(f"the clock jumped backwards by {-jump.delta.nanoseconds * 1e-9:.3f} s")
+            self._submit(self._clear_markers)
+
+    def _on_incompatible_qos(self, topic: str, subscribing: bool, event: Any) -> None:
+        advice = qos_advice(topic, QoSPolicyKind(event.last_policy_kind), subscribing=subscribing)
+        self._incompatible[topic] = (subscribing, advice)
+        self.get_logger().warning(advice)
+
+    def _on_matched(self, topic: str, event: Any) -> None:
+        self._publishers_of[topic] = event.current_count
+
+    # Estimates out: the worker's side.
+
+    def _ask_for_estimate(self) -> None:
+        """Have the worker estimate what changed. Views that come while it works wait for its next round."""
+        if not self._estimate_asked:
+            self._estimate_asked = True
+            self._submit(self._estimate_pending)
+
+    def _submit(self, job: Callable[[], Any]) -> Future[Any] | None:
+        """Queue a job for the worker; None when there is no worker any more."""
+        with self._jobs_lock:
+            if self._worker is None or self._closing:
+                return None
+            try:
+                future = self._worker.submit(self._run_job, job)
+            except RuntimeError:  # The worker was shut down in between.
+                return None
+            self._jobs = {each for each in self._jobs if not each.done()} | {future}
+        return future
+
+    def _run_job(self, job: Callable[[], Any]) -> Any:
+        try:
+            return job()
+        except Exception:
+            if not self._closing:
+                self.get_logger().error(f"The worker failed:\n{traceback.format_exc()}")
+            return None
+
+    def _estimate_pending(self) -> None:
+        # Cleared first: a view that arrives from here on asks again.
+        self._estimate_asked = False
+        scanner = self._scanner
+        while scanner is not None and not self._closing and scanner.pending():
+            self._publish(scanner.estimate_pending())
+
+    def _publish(self, results: Sequence[Result]) -> None:
+        from relpose_ros.scanning.outgoing import estimate_message, markers, pose_array
+
+        frame, types = self._settings.object_frame, _message_types()
+        for result in results:
+            if self._closing:
+                return
+            estimate, scan = result.estimate, result.scan
+            self._outputs["~/estimate"].publish(estimate_message(estimate, scan, types, frame))
+            self._outputs["~/poses"].publish(pose_array(estimate, scan, types, frame))
+            self._outputs["~/markers"].publish(markers(estimate, scan, types, frame))
+            done = f"{len(scan.views)} views in {estimate.seconds:.2f} s"
+            self.get_logger().info(f"{estimate.object_id}: {done}: {estimate.status}")
+
+    def _clear_markers(self) -> None:
+        self._outputs["~/markers"].publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL)]))
+
+    # Services.
+
+    def _on_reset(self, _: Any, response: Any) -> Any:
+        scanner = self._scanner_if_active(response)
+        if scanner is not None:
+            forgotten = scanner.reset("a client asked for it")
+            self._submit(self._clear_markers)
+            response.success, response.message = True, f"{forgotten} views forgotten."
+        return response
+
+    def _on_drop_last_view(self, _: Any, response: Any) -> Any:
+        scanner = self._scanner_if_active(response)
+        if scanner is not None:
+            receipt = scanner.drop_last_view()
+            self._ask_for_estimate()
+            response.success, response.message = receipt.accepted, receipt.reason
+        return response
+
+    def _on_estimate_now(self, _: Any, response: Any) -> Any:
+        scanner = self._scanner_if_active(response)
+        if scanner is None:
+            return response
+
+        def estimate() -> list[Result]:
+            results = scanner.estimate_now()
+            self._publish(results)
+            return results
+
+        job = self._submit(estimate)
+        try:
+            results = job.result() if job is not None else None
+        except CancelledError:
+            results = None
+        if results is None:
+            response.success, response.message = False, "The node stopped before the estimate was made."
+        elif not results:
+            response.success, response.message = False, "No object has two views yet."
+        else:
+            response.success = True
+            estimates = [result.estimate for result in results]
+            response.message = "; ".join(f"{each.object_id}: {each.status}" for each in estimates)
+        return response
+
+    def _scanner_if_active(self, response: Any) -> Scanner | None:
+        if not self._active:
+            response.success, response.message = False, "The node is not active: activate it first."
+            return None
+        return self._scanner
+
+    def _on_change_state(self, change: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+        # A transition that the state does not allow makes rclpy raise, and the client would wait for ever.
+        try:
+            return change(request, response)
+        except Exception as err:
+            self.get_logger().warning(f"The transition {request.transition.id} is refused: {err}")
+            response.success = False
+            return response
+
+    # Parameters.
+
+    def _judge_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        try:
+            changed_settings(self._settings, parameters, configured=self._scanner is not None)
+        except SettingsError as err:
+            return SetParametersResult(successful=False, reason=str(err))
+        return SetParametersResult(successful=True)
+
+    def _take_parameters(self, parameters: Sequence[Parameter]) -> None:
+        old = self._settings
+        self._settings = changed_settings(old, parameters, configured=False)
+        if self._scanner is not None and self._settings != old:
+            self._scanner.change_settings(self._settings)
+        if (old.diagnostics, old.diagnostics_period_s) != (
+            self._settings.diagnostics,
+            self._settings.diagnostics_period_s,
+        ):
+            self._set_diagnostics_timer()
+
+    # Diagnostics.
+
+    def _set_diagnostics_timer(self) -> None:
+        if self._diagnostics_timer is not None:
+            self.destroy_timer(self._diagnostics_timer)
+            self._diagnostics_timer = None
+        if self._settings.diagnostics:
+            # Steady, so that they go on while simulated time stands still.
+            self._diagnostics_timer = self.create_timer(
+                self._settings.diagnostics_period_s,
+                self._publish_diagnostics,
+                clock=Clock(clock_type=ClockType.STEADY_TIME),
+            )
+
+    def _publish_diagnostics(self) -> None:
+        scanner = self._scanner
+        status = diagnostic_status(
+            self.get_fully_qualified_name(),
+            self._state_machine.current_state[1],
+            self._failure,
+            scanner.statistics() if scanner is not None else None,
+            dict(self._publishers_of),
+            dict(self._longest_callback_s),
+            self._incompatible_now(),
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def _incompatible_now(self) -> dict[str, str]:
+        """The advice for each topic whose other end is still there."""
+        for topic, (subscribing, _) in list(self._incompatible.items()):
+            others = self.count_publishers(topic) if subscribing else self.count_subscribers(topic)
+            if others == 0:
+                del self._incompatible[topic]
+        return {topic: advice for topic, (_, advice) in self._incompatible.items()}
+
+
+@functools.cache
+def _message_types() -> dict[str, Any]:
+    from relpose_ros.scanning.outgoing import TYPE_NAMES
+
+    parts = {name: name.split("/") for name in TYPE_NAMES}
+    return {name: getattr(import_module(f"{part[0]}.msg"), part[2]) for name, part in parts.items()}
