@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import pickle
 import re
 import warnings
@@ -120,12 +119,13 @@ def write_network(
     }
     written = {**(metadata or {}), **_preset_metadata(network.preset), "digest": digest(state)}
     beside = target.with_name(target.name + ".partial")
+    safetensors = _safetensors()
     try:
-        _safetensors().save_file(state, beside, metadata=written)
-        os.replace(beside, target)  # noqa: PTH105 - a rename within one folder is all or nothing
-    except OSError as err:
-        text = f"The weights cannot be written to '{target}': {err.strerror or err}."
-        raise NetworkFileError(text) from err
+        safetensors.torch.save_file(state, beside, metadata=written)
+        beside.replace(target)
+    except (OSError, safetensors.SafetensorError) as err:
+        beside.unlink(missing_ok=True)
+        raise NetworkFileError(f"The weights cannot be written to '{target}': {err}.") from err
     return written
 
 
@@ -185,20 +185,20 @@ def _is_safetensors(file: Path) -> bool:
 
 def _safetensors() -> ModuleType:
     try:
-        import safetensors.torch
+        import safetensors.torch  # here, because the core must import without it
     except ImportError as err:
         text = "Reading and writing safetensors needs the package 'safetensors': pip install safetensors."
         raise NetworkFileError(text) from err
-    return safetensors.torch
+    return safetensors
 
 
 def _read_safetensors(file: Path, *, tensors: bool = True) -> tuple[Tensors, dict[str, str]]:
-    open_file = _safetensors().safe_open
+    safetensors = _safetensors()
     try:
-        with open_file(file, framework="pt") as content:
+        with safetensors.safe_open(file, framework="pt") as content:
             metadata = dict(content.metadata() or {})
             state = {name: content.get_tensor(name) for name in content.keys()} if tensors else {}  # noqa: SIM118
-    except Exception as err:  # the reader has its own errors beside OSError and those of torch
+    except (OSError, RuntimeError, ValueError, safetensors.SafetensorError) as err:
         text = (
             f"The weights file '{file}' is a damaged or truncated safetensors file ({err}); fetch it again."
         )

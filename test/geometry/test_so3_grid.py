@@ -47,7 +47,7 @@ def test_children_lie_around_their_parent(level: int) -> None:
 
 
 def test_cells_have_equal_volumes() -> None:
-    """Descendants fill a cell evenly, so random rotations fall evenly on level-0 cells by nearest descendant."""
+    """Descendants fill a cell evenly: by nearest descendant, random rotations fall evenly on all cells."""
     drawn = so3.random_rotations(6000, np.random.default_rng(1))
     fine = so3_grid.grid(2)
     nearest = np.concatenate([np.argmin(angles(part, fine), 1) for part in np.split(drawn, 6)])
