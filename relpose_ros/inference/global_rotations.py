@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from relpose_ros.geometry import so3
+from relpose_ros.inference.pair_distribution import ascend
 
 if TYPE_CHECKING:
     from relpose_ros.inference.pair_distribution import PairDistributions
@@ -25,21 +26,30 @@ if TYPE_CHECKING:
 class AscentSettings:
     """How the joint maximum is looked for."""
 
-    beam: int = 12
+    beam: int = 24
     """Partial solutions kept while cameras join."""
-    starts: int = 6
-    """Complete ones that are climbed."""
-    climb_stride: float = math.radians(4)
+    effort: int = 84
+    """Pairs times climbers: three climbers with 8 views, and more where a climber costs less."""
+    most_climbers: int = 24
+    climb_stride: float = math.radians(8)
     """First step of a joint climb, rad."""
     climb_steps: int = 16
-    finalists: int = 3
-    """Climbers that go on to sweeps; the others are kept as runners-up."""
-    radii: tuple[float, ...] = tuple(math.radians(a) for a in (4, 2, 1))
+    jumps: int = 2
+    """Sweeps in which a camera may leave for any mode of its pairs."""
+    hops: int = 5
+    """Places considered for a camera in such a sweep."""
+    hop_steps: int = 8
+    """Gradient steps at each before they are compared."""
+    radii: tuple[float, ...] = tuple(math.radians(a) for a in (8, 4, 2, 1))
     """Neighbourhood of each sweep over the cameras, rad."""
-    polish_stride: float = math.radians(0.5)
-    polish_steps: int = 16
+    last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (4, 2, 1, 0.5, 0.25))
+    """The same for the best climber alone, at the end."""
     distinct: float = math.radians(10)
     """Solutions are different where some camera differs by more, rad."""
+
+    def climbers(self, pairs: int) -> int:
+        """How many solutions are climbed for so many pairs."""
+        return min(self.most_climbers, max(3, round(self.effort / pairs)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,24 +73,34 @@ def solve(
     energies: PairEnergies, distributions: PairDistributions, settings: AscentSettings = AscentSettings()
 ) -> JointSolutions:
     """The joint maximum and the other local maxima that were met on the way."""
+    climbers = settings.climbers(energies.count)
     rotations = _grow(energies, distributions, settings)
-    rotations, scores = _best(energies, rotations, settings.starts, settings.distinct)
+    rotations, _ = _best(energies, rotations, 2 * climbers, settings.distinct)
     rotations = _climb(energies, rotations, settings.climb_stride, settings.climb_steps)
-    rotations, scores = _best(energies, rotations, settings.starts, settings.distinct)
-    finalists, others = rotations[: settings.finalists], rotations[settings.finalists :]
-    jumped = _sweep(energies, distributions, finalists[:1], settings.climb_stride)
-    finalists, _ = _best(energies, torch.cat([finalists, jumped]), settings.finalists, settings.distinct)
+    starts, _ = _best(energies, rotations, 2 * climbers, settings.distinct)
+    rotations = starts[:climbers]
+    for _ in range(settings.jumps):
+        rotations = _jump(energies, distributions, rotations, settings)
+    # Jumps may all end on one hill: where they started is kept beside, for a runner-up to be told.
+    rotations, _ = _best(energies, torch.cat([rotations, starts]), climbers, settings.distinct)
     for radius in settings.radii:
-        finalists = _sweep(energies, None, finalists, radius)
-    finalists = _climb(energies, finalists, settings.polish_stride, settings.polish_steps)
-    rotations, scores = _best(energies, torch.cat([finalists, others]), settings.starts, settings.distinct)
-    return JointSolutions(rotations @ rotations[:, :1].mT, scores)
+        rotations = _sweep(energies, rotations, radius)
+    rotations, scores = _best(energies, torch.cat([rotations, starts]), climbers, settings.distinct)
+    winner = rotations[:1]
+    for radius in settings.last_radii:
+        winner = _sweep(energies, winner, radius)
+    rotations, scores = _best(energies, torch.cat([winner, rotations[1:]]), climbers, settings.distinct)
+    return JointSolutions(rotations, scores)
 
 
 def _best(
     energies: PairEnergies, rotations: torch.Tensor, count: int, angle: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The best distinct ones of some solutions, best first. -> (<= count, N, 3, 3), (<= count,)."""
+    """The best distinct ones of some solutions, the first camera turned to the identity, best first.
+
+    -> (<= count, N, 3, 3), (<= count,).
+    """
+    rotations = rotations @ rotations[:, :1].mT
     scores = joint_scores(energies, rotations)
     keep = _distinct(rotations, scores, count, angle)
     return rotations[keep], scores[keep]
@@ -158,7 +178,7 @@ def _distinct(rotations: torch.Tensor, scores: torch.Tensor, count: int, angle: 
     (S, N, 3, 3) and (S,) -> (<= count,).
     """
     least_trace = 1 + 2 * math.cos(angle)
-    flat = (rotations @ rotations[:, :1].transpose(-1, -2)).flatten(2)  # (S, N, 9)
+    flat = rotations.flatten(2)  # (S, N, 9)
     left = scores.clone()
     keep: list[int] = []
     while len(keep) < count:
@@ -185,19 +205,46 @@ def _neighbourhood() -> torch.Tensor:
 NEIGHBOURHOOD = _neighbourhood()
 
 
-def _sweep(
-    energies: PairEnergies, distributions: PairDistributions | None, rotations: torch.Tensor, radius: float
+def _jump(
+    energies: PairEnergies,
+    distributions: PairDistributions,
+    rotations: torch.Tensor,
+    settings: AscentSettings,
 ) -> torch.Tensor:
-    """Moves every camera in turn to the best of its candidates. (S, N, 3, 3) -> (S, N, 3, 3)."""
+    """Moves every camera in turn to the best hill that a mode of one of its pairs leads up to.
+
+    The modes only say where to start: what all pairs of a camera agree on may be the top of none of them.
+    (S, N, 3, 3) -> (S, N, 3, 3).
+    """
+    rotations = rotations.clone()
+    for camera in range(energies.views):
+        others = [other for other in range(energies.views) if other != camera]
+        modes = _mode_candidates(energies, distributions, rotations, camera, others)
+        candidates = torch.cat([rotations[:, camera, None], modes], 1)
+        gains = _conditional(energies, rotations, camera, others, candidates)
+        for row in range(len(rotations)):
+            keep = _distinct(candidates[row][:, None], gains[row], settings.hops, settings.distinct)
+            here = rotations[row : row + 1]
+            hills, heights = ascend(
+                lambda each: _conditional(energies, here, camera, others, each[None])[0],
+                candidates[row][keep],
+                settings.climb_stride,
+                settings.hop_steps,
+            )
+            best = heights.argmax()
+            if heights[best] > gains[row, 0]:
+                rotations[row, camera] = hills[best]
+    return rotations
+
+
+def _sweep(energies: PairEnergies, rotations: torch.Tensor, radius: float) -> torch.Tensor:
+    """Moves every camera in turn to the best place around it. (S, N, 3, 3) -> (S, N, 3, 3)."""
     rotations = rotations.clone()
     offsets = so3.exp_tensor(NEIGHBOURHOOD * radius)  # the first is the identity: no camera gets worse
     rows = torch.arange(len(rotations))
     for camera in range(energies.views):
         others = [other for other in range(energies.views) if other != camera]
         candidates = offsets @ rotations[:, camera, None]
-        if distributions is not None:
-            modes = _mode_candidates(energies, distributions, rotations, camera, others)
-            candidates = torch.cat([candidates, modes], 1)
         gains = _conditional(energies, rotations, camera, others, candidates)
         rotations[:, camera] = candidates[rows, gains.argmax(1)]
     return rotations

@@ -18,6 +18,8 @@ import torch
 from relpose_ros.geometry import so3, so3_grid
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 
 
@@ -127,7 +129,10 @@ def _refine_modes(
     count = modes.shape[1]
     pairs = torch.arange(energies.count).repeat_interleave(count)
     refined, best = ascend(
-        energies, pairs, modes.flatten(0, 1), stride=spacing / 2, steps=settings.refinement_steps
+        lambda rotations: energies.at(pairs, rotations[:, None])[:, 0],
+        modes.flatten(0, 1),
+        stride=spacing / 2,
+        steps=settings.refinement_steps,
     )
     refined, best = refined.view_as(modes), best.view_as(values).masked_fill(values == -math.inf, -math.inf)
     best, order = torch.sort(best, dim=1, descending=True, stable=True)
@@ -141,30 +146,29 @@ def _refine_modes(
 
 
 def ascend(
-    energies: PairEnergies, pairs: torch.Tensor, rotations: torch.Tensor, stride: float, steps: int
+    height: Callable[[torch.Tensor], torch.Tensor], rotations: torch.Tensor, stride: float, steps: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Climbs the energy of each pair along its gradient on the tangent space.
+    """Climbs many rotations at once, each along its own gradient on the tangent space.
 
-    The stride grows while the energy does and halves where it would not: such energies have ripples of
-    any steepness, so that the gradient's direction is trusted and its length is not.
+    The stride grows while the height does and shrinks where it would not: energies have ripples of any
+    steepness, so that the gradient's direction is trusted and its length is not.
 
     Args:
-        energies: of the scan.
-        pairs: (Q,) int64, which pair each rotation belongs to.
+        height: of each rotation, (Q, 3, 3) -> (Q,), differentiable.
         rotations: (Q, 3, 3) float64 starts.
         stride: first step, rad.
         steps: how many.
 
     Returns:
-        Rotations (Q, 3, 3) and energies (Q,), none lower than at the start.
+        Rotations (Q, 3, 3) and heights (Q,), none lower than at the start.
     """
     here = rotations
-    value, slope = _slope(energies, pairs, here)
+    value, slope = _slope(height, here)
     length = torch.full_like(value, stride)
     for _ in range(steps):
         direction = slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-12)
         there = so3.exp_tensor(direction * length[:, None]) @ here
-        new_value, new_slope = _slope(energies, pairs, there)
+        new_value, new_slope = _slope(height, there)
         better = new_value > value
         here = torch.where(better[:, None, None], there, here)
         slope = torch.where(better[:, None], new_slope, slope)
@@ -174,11 +178,11 @@ def ascend(
 
 
 def _slope(
-    energies: PairEnergies, pairs: torch.Tensor, rotations: torch.Tensor
+    height: Callable[[torch.Tensor], torch.Tensor], rotations: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Energies (Q,) and their gradients (Q, 3) for left perturbations of the rotations."""
+    """Heights (Q,) and their gradients (Q, 3) for left perturbations of the rotations."""
     with torch.enable_grad():
         tangent = torch.zeros(len(rotations), 3, dtype=torch.float64, requires_grad=True)
-        value = energies.at(pairs, (so3.exp_tensor(tangent) @ rotations)[:, None])[:, 0]
+        value = height(so3.exp_tensor(tangent) @ rotations)
         (slope,) = torch.autograd.grad(value.sum(), tangent)
     return value.detach().double(), slope
