@@ -184,7 +184,7 @@ def read_mesh(path: Path) -> tuple[shapes.Mesh, Image | None]:
     material = getattr(loaded.visual, "material", None)
     picture = getattr(material, "baseColorTexture", None)
     pixels = None if picture is None else np.ascontiguousarray(np.asarray(picture.convert("RGB"), np.uint8))
-    return shapes.creased(loaded.vertices, faces, uvs, 50.0), pixels
+    return shapes.creased(loaded.vertices, faces, uvs), pixels
 
 
 @lru_cache(maxsize=512)

@@ -268,7 +268,8 @@ class Renderer:
         Returns:
             (N, height, width, 4): RGB, and the object's coverage of the pixel, 0 to 255.
         """
-        with self._uploaded(scene) as loaded:
+        # A process may hold several contexts, of which one is current.
+        with self._gl, self._uploaded(scene) as loaded:
             drawn = self._colours(scene, loaded, windows, _enlarged(size, supersampling), sharpness)
         return _shrunk(drawn, size)
 
@@ -288,7 +289,8 @@ class Renderer:
             The pictures, and (N, height // stride, width // stride, 3) object coordinates at the
             centres of cells of ``stride`` pixels, NaN off the object.
         """
-        with self._uploaded(scene) as loaded:
+        # A process may hold several contexts, of which one is current.
+        with self._gl, self._uploaded(scene) as loaded:
             drawn = self._colours(scene, loaded, windows, _enlarged(size, supersampling), sharpness)
             places = self._places(scene, loaded, windows, (size[0] // stride, size[1] // stride))
         return _shrunk(drawn, size), places

@@ -222,7 +222,6 @@ def directions(
     step = rng.uniform(0.4, 1.0) * min(largest_step, 60)
     found = [_direction(azimuth, elevation)]
     while len(found) < views:
-        best, smallest = found[-1], np.inf
         for attempt in range(40):
             shrink = 1.0 if attempt < 20 else 0.5
             if walking:
@@ -234,13 +233,14 @@ def directions(
                 height = rng.normal(centre, spread)
             height = float(np.clip(height, lowest, 85))
             candidate = _direction(wander, height)
-            angle = float(np.degrees(np.arccos(np.clip(candidate @ found[-1], -1, 1))))
-            if angle < smallest:
-                best, smallest, chosen = candidate, angle, (wander, height)
-            if angle <= largest_step:
+            if np.degrees(np.arccos(np.clip(candidate @ found[-1], -1, 1))) <= largest_step:
                 break
-        azimuth, elevation = chosen
-        found.append(best)
+        else:
+            # At one height the angle is never larger than the step in azimuth.
+            wander, height = azimuth + rng.uniform(-largest_step, largest_step), elevation
+            candidate = _direction(wander, height)
+        azimuth, elevation = wander, height
+        found.append(candidate)
     return np.array(found)
 
 

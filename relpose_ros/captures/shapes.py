@@ -61,8 +61,7 @@ class Mesh:
     def transformed(self, matrix: npt.ArrayLike, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
         """Apply ``x -> matrix x + offset`` (3x3, any invertible one)."""
         m = np.asarray(matrix, np.float64)
-        # Normals follow the inverse transpose; a mirrored body needs them turned out again.
-        normals = self.normals @ np.linalg.inv(m) * np.sign(np.linalg.det(m))
+        normals = self.normals @ np.linalg.inv(m)
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         return replace(self, positions=self.positions @ m.T + np.asarray(offset, np.float64), normals=normals)
 
@@ -100,20 +99,26 @@ def creased(
         positions: (V, 3).
         triangles: (F, 3) vertex indices.
         uvs: (V, 2).
-        crease_degrees: A corner whose face turns away from the smooth normal by more stays flat.
+        crease_degrees: A corner whose face turns away from the smooth normal by more stays flat. The
+            edge of a box turns by 45 degrees.
     """
     v, f, uv = np.asarray(positions, np.float64), np.asarray(triangles, np.int64), np.asarray(uvs, np.float64)
     _, place = np.unique(np.round(v * 1e5).astype(np.int64), axis=0, return_inverse=True)
     place = place.reshape(-1)[f]
     face = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
+    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-20)
     smooth = np.zeros((int(place.max()) + 1, 3))
     for corner in range(3):
-        np.add.at(smooth, place[:, corner], face)
-    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-20)
+        # Weighted by the corner's angle: how a side is cut into triangles then makes no difference.
+        one = v[f[:, (corner + 1) % 3]] - v[f[:, corner]]
+        other = v[f[:, (corner + 2) % 3]] - v[f[:, corner]]
+        angle = np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), (one * other).sum(1))
+        np.add.at(smooth, place[:, corner], face * angle[:, None])
     smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-20)
     corners = smooth[place]
     flat = np.broadcast_to(face[:, None], corners.shape)
     hard = (corners * flat).sum(-1) < np.cos(np.radians(crease_degrees))
+    hard &= flat.any(-1)  # a triangle without area has no normal of its own
     corners = np.where(hard[..., None], flat, corners)
     # Corners that agree in place, texture and normal share one vertex: a third of the vertex work.
     key = np.concatenate([f.reshape(-1, 1), np.round(corners.reshape(-1, 3) * 200).astype(np.int64)], 1)
@@ -135,12 +140,11 @@ def grid_surface(points: FloatArray, *, u_repeat: float = 1.0, v_repeat: float =
     if np.allclose(points[:, 0], points[:, -1]):
         dv[:, 0] = dv[:, -1] = (points[:, 1] - points[:, -2]) / 2
     normals = np.cross(du, dv)
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    # At a pole one tangent vanishes: the mean over its row is the pole's normal.
-    for row in (0, -1):
-        if length[row].max() < 1e-9:
-            neighbours = normals[1 if row == 0 else -2].sum(0)
-            normals[row] = neighbours
+    # At a pole, where a whole line is one point, a tangent vanishes: its neighbours' mean is its normal.
+    for lines, places in ((normals, points), (normals.swapaxes(0, 1), points.swapaxes(0, 1))):
+        for pole, beside in ((0, 1), (-1, -2)):
+            if np.allclose(places[pole], places[pole, 0]):
+                lines[pole] = lines[beside].sum(0)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     normals = normals / np.maximum(length, 1e-12)
     u, v = np.meshgrid(np.linspace(0, u_repeat, m), np.linspace(0, v_repeat, n), indexing="ij")
