@@ -36,7 +36,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from relpose_ros.errors import RelPoseError
 from relpose_ros.msg import ObjectView, ScanEstimate
 from relpose_ros.node.parameters import changed_settings, declare_parameters
-from relpose_ros.node.reports import Throttle, diagnostic_status, qos_advice
+from relpose_ros.node.reports import NodeHealth, Throttle, diagnostic_status, qos_advice
 from relpose_ros.scanning.scanner import Scanner
 from relpose_ros.scanning.settings import SettingsError
 
@@ -123,6 +123,7 @@ class ScanNode(LifecycleNode):
         self._active = False
         self._closing = False
         self._failure = ""
+        self._failing = False
         self._inputs: list[Any] = []
         self._services_of_scan: list[Any] = []
         self._outputs: dict[str, Any] = {}
@@ -297,7 +298,7 @@ class ScanNode(LifecycleNode):
             self.destroy_lifecycle_publisher(publisher)
         self._inputs, self._services_of_scan, self._outputs = [], [], {}
         self._worker = self._scanner = self._jump = None
-        self._estimate_asked = False
+        self._estimate_asked = self._failing = False
         self._incompatible.clear()
         self._longest_callback_s.clear()
         self._publishers_of.clear()
@@ -367,7 +368,15 @@ class ScanNode(LifecycleNode):
         self._estimate_asked = False
         scanner = self._scanner
         while scanner is not None and not self._closing and scanner.pending():
-            self._publish(scanner.estimate_pending())
+            self._estimate(scanner, scanner.estimate_pending)
+
+    def _estimate(self, scanner: Scanner, estimate: Callable[[], list[Result]]) -> list[Result]:
+        """One round of estimates, published."""
+        failed_before = scanner.statistics().failed
+        results = estimate()
+        self._failing = scanner.statistics().failed > failed_before
+        self._publish(results)
+        return results
 
     def _publish(self, results: Sequence[Result]) -> None:
         from relpose_ros.scanning.outgoing import estimate_message, markers, pose_array
@@ -409,12 +418,7 @@ class ScanNode(LifecycleNode):
         if scanner is None:
             return response
 
-        def estimate() -> list[Result]:
-            results = scanner.estimate_now()
-            self._publish(results)
-            return results
-
-        job = self._submit(estimate)
+        job = self._submit(lambda: self._estimate(scanner, scanner.estimate_now))
         try:
             results = job.result() if job is not None else None
         except CancelledError:
@@ -422,7 +426,8 @@ class ScanNode(LifecycleNode):
         if results is None:
             response.success, response.message = False, "The node stopped before the estimate was made."
         elif not results:
-            response.success, response.message = False, "No object has two views yet."
+            response.success = False
+            response.message = "The estimate failed." if self._failing else "No object has two views yet."
         else:
             response.success = True
             estimates = [result.estimate for result in results]
@@ -480,15 +485,16 @@ class ScanNode(LifecycleNode):
 
     def _publish_diagnostics(self) -> None:
         scanner = self._scanner
-        status = diagnostic_status(
-            self.get_fully_qualified_name(),
-            self._state_machine.current_state[1],
-            self._failure,
-            scanner.statistics() if scanner is not None else None,
-            dict(self._publishers_of),
-            dict(self._longest_callback_s),
-            self._incompatible_now(),
+        health = NodeHealth(
+            state=self._state_machine.current_state[1],
+            failure=self._failure,
+            failing=self._failing,
+            publishers=dict(self._publishers_of),
+            longest_callbacks_s=dict(self._longest_callback_s),
+            incompatible=self._incompatible_now(),
         )
+        statistics = scanner.statistics() if scanner is not None else None
+        status = diagnostic_status(self.get_fully_qualified_name(), health, statistics)
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import time
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -92,39 +93,41 @@ def qos_advice(topic: str, kind: QoSPolicyKind, *, subscribing: bool) -> str:
     )
 
 
-def diagnostic_status(
-    name: str,
-    state: str,
-    failure: str,
-    statistics: Statistics | None,
-    publishers: Mapping[str, int],
-    longest_callbacks_s: Mapping[str, float],
-    incompatible: Mapping[str, str],
-) -> DiagnosticStatus:
-    """The node's one diagnostics entry.
+@dataclass(frozen=True)
+class NodeHealth:
+    """What the node knows of itself, beside its scanner's statistics."""
 
-    Args:
-        name: The node's name.
-        state: Its lifecycle state.
-        failure: Why the last configuration failed; empty where it did not.
-        statistics: The scanner's; None while there is none.
-        publishers: How many of them each topic listens to: none is why nothing arrives.
-        longest_callbacks_s: Seconds of the slowest callback so far, by topic.
-        incompatible: What to do about QoS that does not fit, by topic.
-    """
-    level, message = DiagnosticStatus.OK, state
+    state: str
+    """Of the lifecycle."""
+    failure: str = ""
+    """Why the last configuration failed; empty where it did not."""
+    failing: bool = False
+    """Whether the last estimate ended in an error."""
+    publishers: Mapping[str, int] = field(default_factory=dict)
+    """How many of them each topic listens to: none is why nothing arrives."""
+    longest_callbacks_s: Mapping[str, float] = field(default_factory=dict)
+    """The slowest callback so far, by topic."""
+    incompatible: Mapping[str, str] = field(default_factory=dict)
+    """What to do about QoS that does not fit, by topic."""
+
+
+def diagnostic_status(name: str, health: NodeHealth, statistics: Statistics | None) -> DiagnosticStatus:
+    """The node's one diagnostics entry. The statistics are None while there is no scanner."""
+    level, message = DiagnosticStatus.OK, health.state
     if statistics is not None:
         views = sum(scan.views for scan in statistics.scans.values())
-        message = f"{state}: {views} views of {len(statistics.scans)} objects"
-        if statistics.last_failure:
-            level, message = DiagnosticStatus.WARN, f"an estimate failed: {statistics.last_failure}"
-    if incompatible:
-        level, message = DiagnosticStatus.WARN, next(iter(incompatible.values()))
-    if failure:
-        level, message = DiagnosticStatus.ERROR, failure
-    values = [("state", state), *((f"{topic} QoS", advice) for topic, advice in incompatible.items())]
-    values += ((f"{topic} publishers", str(count)) for topic, count in publishers.items())
-    values += ((f"{topic} slowest callback ms", f"{1e3 * s:.2f}") for topic, s in longest_callbacks_s.items())
+        message = f"{health.state}, objects: {len(statistics.scans)}, views: {views}"
+        if health.failing:
+            level, message = DiagnosticStatus.WARN, statistics.last_failure
+    if health.incompatible:
+        level, message = DiagnosticStatus.WARN, next(iter(health.incompatible.values()))
+    if health.failure:
+        level, message = DiagnosticStatus.ERROR, health.failure
+    values = [("state", health.state)]
+    values += ((f"{topic} QoS", advice) for topic, advice in health.incompatible.items())
+    values += ((f"{topic} publishers", str(count)) for topic, count in health.publishers.items())
+    for topic, seconds in health.longest_callbacks_s.items():
+        values.append((f"{topic} slowest callback ms", f"{1e3 * seconds:.2f}"))
     if statistics is not None:
         values += _statistics_values(statistics)
     return DiagnosticStatus(

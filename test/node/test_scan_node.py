@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -199,15 +200,21 @@ def test_parameters_are_described_and_judged(node: Any, graph: Any) -> None:
 
 
 def test_how_long_a_full_hd_frame_holds_the_callbacks(node: Any, graph: Any, make: Any) -> None:
-    key = f"{IMAGE} slowest callback ms"
     before = graph.count(IMAGE, "received")
-    for k in range(10):
-        stamp = 10.0 + k
+    stamps = iter(range(10, 100))
+
+    def estimated() -> bool:
+        # Best effort loses frames of 6 MB where the machine has more to do: send until enough came through.
+        stamp = float(next(stamps))
         graph.publish(CAMERA_INFO, make.camera_info(stamp, 1920, 1080))
         graph.publish(IMAGE, make.image(stamp, 1920, 1080))
-    graph.wait_until(lambda: graph.count(IMAGE, "received") > before, "an image")
-    print(f"1920x1080 rgb8: slowest callback {graph.diagnostic(key)} ms")
-    graph.estimate_of("object", views=2)
+        time.sleep(0.1)
+        return bool(graph.estimates)
+
+    graph.wait_until(estimated, "an estimate of two frames")
+    received, sent = graph.count(IMAGE, "received") - before, next(stamps) - 10
+    slowest = graph.diagnostic(f"{IMAGE} slowest callback ms")
+    print(f"1920x1080 rgb8, {received} of {sent} frames got through: slowest callback {slowest} ms")
 
 
 def test_transitions(node: Any, graph: Any, make: Any, tmp_path: Path) -> None:
