@@ -10,6 +10,7 @@ import argparse
 import logging
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from relpose_ros.errors import RelPoseError
@@ -96,6 +97,16 @@ def _parser() -> argparse.ArgumentParser:
         help="standard messages with the box as region of interest (default), or this package's ObjectView",
     )
 
+    pack.add_argument(
+        "--object-id",
+        default="",
+        metavar="ID",
+        help="of the object, for ObjectView (default: the folder's name)",
+    )
+    pack.add_argument(
+        "--period", type=float, default=1.0, metavar="S", help="seconds between two photos (default: 1)"
+    )
+
     evaluate = command(
         "evaluate",
         _evaluate,
@@ -122,6 +133,70 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--seed", type=int, default=0, help="seed of those orders (default: 0)")
     evaluate.add_argument("--output", type=Path, metavar="FILE", help="JSON file for the rows")
     _add_weights(evaluate)
+
+    render = command(
+        "render",
+        _render,
+        "Render synthetic scans with exact poses: captures, training shards or the demo bags.",
+    )
+    render.add_argument("output", type=Path, metavar="DIR", help="folder to write into")
+    render.add_argument(
+        "--as",
+        dest="form",
+        choices=("captures", "shards", "demo-bags"),
+        default="captures",
+        help="captures of whole photographs (default), shards of crops for the trainer, or the bags of bags/",
+    )
+    render.add_argument("--count", type=int, default=1, metavar="K", help="captures or shards (default: 1)")
+    render.add_argument("--views", type=int, default=10, metavar="N", help="views of each scan (default: 10)")
+    render.add_argument("--seed", type=int, default=0, help="names the endless list of scans (default: 0)")
+    render.add_argument(
+        "--assets",
+        type=Path,
+        metavar="DIR",
+        help="folder with meshes/ and backgrounds/ (default: procedural alone)",
+    )
+    render.add_argument(
+        "--split", choices=("train", "held_out"), default="train", help="which meshes (default: train)"
+    )
+    render.add_argument(
+        "--size", type=int, default=128, metavar="PX", help="side of the crops of a shard (default: 128)"
+    )
+    render.add_argument(
+        "--processes", type=int, default=1, metavar="K", help="processes that render shards (default: 1)"
+    )
+
+    train = command(
+        "train", _train, "Train a network on rendered shards, or go on with a run that was stopped."
+    )
+    train.add_argument(
+        "run_folder", type=Path, metavar="RUN", help="folder of the run: curve, checkpoint, weights"
+    )
+    train.add_argument(
+        "--scans", type=Path, nargs="+", required=True, metavar="DIR", help="folders of shards to learn from"
+    )
+    train.add_argument(
+        "--held-out",
+        type=Path,
+        nargs="+",
+        metavar="DIR",
+        help="folders of shards of other objects, to measure on",
+    )
+    train.add_argument(
+        "--preset", choices=("compact", "paper"), default="compact", help="which network (default: compact)"
+    )
+    train.add_argument(
+        "--images", type=int, metavar="K", help="images to see in the whole run (default: the preset's)"
+    )
+    train.add_argument(
+        "--budget", type=float, metavar="SECONDS", help="stop after so long; the same command goes on"
+    )
+    train.add_argument(
+        "--device",
+        default="cpu",
+        help="cpu (default), cuda, cuda:1 ... Several processes: start with torchrun",
+    )
+    train.add_argument("--seed", type=int, default=0, help="of the run (default: 0)")
 
     convert = command(
         "convert", _convert, "Turn a released RelPose++ checkpoint into safetensors with its origin inside."
@@ -183,7 +258,13 @@ def _replay(arguments: argparse.Namespace) -> int:
 def _pack(arguments: argparse.Namespace) -> int:
     from relpose_ros.replay.pack import pack
 
-    pack(arguments.capture, arguments.output, form=arguments.form)
+    pack(
+        arguments.capture,
+        arguments.output,
+        form=arguments.form,
+        object_id=arguments.object_id,
+        period_s=arguments.period,
+    )
     return 0
 
 
@@ -202,6 +283,60 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         orders=arguments.orders,
     )
     print(table(rows))
+    return 0
+
+
+def _render(arguments: argparse.Namespace) -> int:
+    if arguments.form == "demo-bags":
+        return _render_demo_bags(arguments.output)
+    if arguments.form == "shards":
+        from relpose_ros.captures.shards import ShardPlan, write_shards
+
+        plan = ShardPlan(
+            seed=arguments.seed,
+            views=arguments.views,
+            image_size=arguments.size,
+            assets=arguments.assets,
+            split=arguments.split,
+        )
+        write_shards(arguments.output, arguments.count, plan, processes=arguments.processes)
+        return 0
+    from tqdm import tqdm
+
+    from relpose_ros.captures.assets import load_assets
+    from relpose_ros.captures.rendered import render_capture
+
+    assets = load_assets(arguments.assets, arguments.split) if arguments.assets else None
+    for index in tqdm(range(arguments.count), unit="capture"):
+        folder = arguments.output / f"{arguments.seed}_{index:05d}"
+        render_capture(folder, arguments.seed, index, arguments.views, assets=assets)
+    return 0
+
+
+def _render_demo_bags(output: Path) -> int:
+    from relpose_ros.captures.demo import render_demo_captures
+    from relpose_ros.replay.pack import pack
+
+    with TemporaryDirectory() as folder:
+        for demo in render_demo_captures(Path(folder)):
+            name, period_s = demo.name, demo.period_s
+            pack(Path(folder, name), output / name, form=demo.form, object_id=name, period_s=period_s)
+    return 0
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from relpose_ros.training.batches import open_scans
+    from relpose_ros.training.trainer import Trainer, settings_for
+
+    settings = replace(settings_for(arguments.preset), seed=arguments.seed)
+    if arguments.images:
+        settings = replace(settings, images=arguments.images)
+    held_out = open_scans(arguments.held_out) if arguments.held_out else None
+    scans = open_scans(arguments.scans)
+    trainer = Trainer(settings, arguments.run_folder, scans, held_out, device=arguments.device)
+    trainer.run(arguments.budget)
     return 0
 
 

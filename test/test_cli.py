@@ -1,0 +1,141 @@
+"""The command line as a user meets it: exit codes, and sentences where something is wrong."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from relpose_ros import cli
+from relpose_ros.captures.folder import Frame, save_capture
+from relpose_ros.geometry.cameras import look_at, translation_of
+from relpose_ros.network.checkpoint import random_network, write_network
+from relpose_ros.views import BoundingBox, Intrinsics, View
+
+COMMANDS = ("node", "replay", "pack", "evaluate", "render", "train", "convert")
+
+
+@pytest.fixture
+def posed_capture(tmp_path):
+    """Three noisy pictures with poses around a point."""
+    random = np.random.default_rng(0)
+    frames = []
+    for azimuth in (0.0, 0.4, 0.9):
+        centre = np.array([np.sin(azimuth), -np.cos(azimuth), 0.3])
+        rotation = look_at(centre, np.zeros(3))
+        view = View(
+            image=random.integers(0, 256, (96, 128, 3), dtype=np.uint8),
+            box=BoundingBox(30, 20, 90, 80),
+            full_width=128,
+            full_height=96,
+            intrinsics=Intrinsics(120.0, 120.0, 64.0, 48.0),
+        )
+        pose = np.column_stack([rotation, translation_of(rotation, centre)])
+        frames.append(Frame(view, pose))
+    return save_capture(tmp_path / "capture", frames).folder
+
+
+@pytest.fixture
+def random_weights(tmp_path):
+    """A weights file of a network that learned nothing."""
+    file = tmp_path / "random.safetensors"
+    write_network(random_network("compact", 0), file, {"source": "random, for a test"})
+    return file
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main([command, "--help"])
+    assert end.value.code == 0
+    assert command in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["replay", "missing_bag", "--output", "out"], "missing_bag"),
+        (["pack", "missing_capture", "--output", "bag"], "missing_capture"),
+        (["evaluate", "missing_capture"], "missing_capture"),
+        (["convert", "missing.pth", "--output", "out.safetensors"], "missing.pth"),
+        (["train", "run", "--scans", "missing_shards"], "shard"),
+    ],
+)
+def test_what_is_missing_is_named_in_one_sentence(arguments, named, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 1
+    printed = capsys.readouterr().err.strip()
+    assert printed.startswith(f"relpose_ros {arguments[0]}: ")
+    assert named in printed
+    assert len(printed.splitlines()) == 1
+    assert "Traceback" not in printed
+
+
+@pytest.mark.parametrize("text", ["", "two", "5..2", "2..", "3.5"])
+def test_numbers_of_views_that_are_none(text, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["evaluate", "capture", "--views", text])
+    assert end.value.code == 2
+    assert "number of views" in capsys.readouterr().err
+
+
+def test_numbers_of_views():
+    arguments = cli._parser().parse_args(["evaluate", "capture", "--views", "3..5"])
+    assert arguments.views == (3, 4, 5)
+    assert cli._parser().parse_args(["evaluate", "capture", "--views", "4"]).views == (4,)
+
+
+def test_a_missing_extra_is_named(monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(sys.modules, "moderngl", None)
+    for name in [each for each in sys.modules if each.startswith("relpose_ros.captures.render")]:
+        monkeypatch.delitem(sys.modules, name)
+    assert cli.main(["render", str(tmp_path)]) == 1
+    assert "pip install 'relpose_ros[train]'" in capsys.readouterr().err
+
+
+def test_a_defect_keeps_its_traceback(monkeypatch):
+    monkeypatch.setattr(cli, "_convert", lambda arguments: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["convert", "a", "--output", "b"])
+
+
+def test_ctrl_c_is_no_defect(monkeypatch):
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_convert", interrupted)
+    assert cli.main(["convert", "a", "--output", "b"]) == 130
+
+
+def test_the_commands_need_no_ros():
+    """Only `node` does: a laptop without ROS replays bags."""
+    code = (
+        "import sys\n"
+        "sys.modules['rclpy'] = None\n"
+        "from relpose_ros import cli\n"
+        "sys.exit(cli.main(['replay', 'missing_bag', '--output', 'out']))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "missing_bag does not exist" in done.stderr
+
+
+def test_a_capture_becomes_a_bag_an_estimate_and_a_row(tmp_path, posed_capture, random_weights):
+    """The main road from end to end, on a tiny capture and a network that knows nothing."""
+    bag, out, rows = tmp_path / "bag", tmp_path / "out", tmp_path / "rows.json"
+    assert cli.main(["pack", str(posed_capture), "--output", str(bag)]) == 0
+    assert cli.main(["replay", str(bag), "--output", str(out), "--weights", str(random_weights)]) == 0
+    scan = json.loads((out / "scan.json").read_text())
+    assert [len(estimate["views"]) for estimate in scan["estimates"]] == [2, 3]
+    assert (out / "report.html").stat().st_size > 10_000
+
+    evaluate = ["evaluate", str(posed_capture), "--views", "2..3", "--orders", "1", "--output", str(rows)]
+    assert (
+        cli.main([*evaluate, "--method", "relpose", "--method", "identity", "--weights", str(random_weights)])
+        == 0
+    )
+    methods = {row["method"] for row in json.loads(rows.read_text())["rows"]}
+    assert methods == {"relpose", "identity"}
