@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relpose_ros.captures import photography
-from relpose_ros.captures.renderer import Renderer, Window
+from relpose_ros.captures.renderer import Renderer, RenderError, Window
 from relpose_ros.captures.scenes import Motion, ScanStyle, Shot, random_scene
 from relpose_ros.network.crops import crop_parameters, crop_square
 from relpose_ros.views import BoundingBox
@@ -72,8 +72,11 @@ class ScanRenderer:
             style: How cameras are drawn.
 
         Raises:
-            RenderError: There is no OpenGL here.
+            RenderError: There is no OpenGL here, or the size is no multiple of 8.
         """
+        if image_size <= 0 or image_size % PLACE_STRIDE:
+            text = f"the side of a crop is {image_size} pixels; it must be a multiple of {PLACE_STRIDE}."
+            raise RenderError(text)
         self._seed = seed
         self._size = image_size
         self._assets = assets

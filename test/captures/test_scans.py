@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from relpose_ros.captures.renderer import Renderer, RenderError
 from relpose_ros.captures.scans import PLACE_STRIDE, ScanRenderer
 from relpose_ros.captures.shards import ShardPlan, read_shard, write_shards
 from relpose_ros.network.crops import crop_parameters
@@ -14,7 +15,6 @@ from relpose_ros.network.crops import crop_parameters
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from relpose_ros.captures.renderer import Renderer
 
 SIZE = 64
 
@@ -51,6 +51,12 @@ def test_crop_parameters_are_those_of_the_network(scans: ScanRenderer) -> None:
     scan = scans.scan(7, 3)
     for crop, size, told in zip(scan.crops, scan.image_sizes, scan.crop_parameters, strict=True):
         assert np.allclose(crop_parameters(*crop.tolist(), *size.tolist()), told)
+
+
+def test_an_odd_size_is_told(renderer: Renderer) -> None:
+    del renderer
+    with pytest.raises(RenderError, match="100 pixels"):
+        ScanRenderer(0, 100)
 
 
 def test_objects_are_in_their_crops(scans: ScanRenderer) -> None:
