@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from relpose_ros.geometry import so3
-from relpose_ros.inference.pair_distribution import ascend
+from relpose_ros.inference.pair_distribution import ascend, peaks
 
 if TYPE_CHECKING:
     from relpose_ros.inference.pair_distribution import PairDistributions
@@ -37,7 +37,7 @@ class AscentSettings:
     jumps: int = 2
     """Sweeps in which a camera may leave for any mode of its pairs."""
     hops: int = 5
-    """Places considered for a camera in such a sweep."""
+    """Places considered for a camera in such a sweep: so many modes, and so many cells of the coarse grid."""
     hop_steps: int = 8
     """Gradient steps at each before they are compared."""
     radii: tuple[float, ...] = tuple(math.radians(a) for a in (8, 4, 2, 1))
@@ -74,7 +74,8 @@ def solve(
 ) -> JointSolutions:
     """The joint maximum and the other local maxima that were met on the way."""
     climbers = settings.climbers(energies.count)
-    rotations = _grow(energies, distributions, settings)
+    roots = range(min(climbers, energies.views))
+    rotations = torch.cat([_grow(energies, distributions, root, settings) for root in roots])
     rotations, _ = _best(energies, rotations, 2 * climbers, settings.distinct)
     rotations = _climb(energies, rotations, settings.climb_stride, settings.climb_steps)
     starts, _ = _best(energies, rotations, 2 * climbers, settings.distinct)
@@ -106,25 +107,28 @@ def _best(
     return rotations[keep], scores[keep]
 
 
-def spanning_order(strengths: torch.Tensor, pair_of: torch.Tensor) -> list[int]:
-    """Cameras in the order in which a maximum spanning tree reaches them from camera 0 (Prim).
+def spanning_order(strengths: torch.Tensor, pair_of: torch.Tensor, root: int = 0) -> list[int]:
+    """Cameras in the order in which a maximum spanning tree reaches them from the root (Prim).
 
     Args:
         strengths: (P,) of the pairs.
         pair_of: (N, N) position of each pair.
+        root: the camera to begin with.
     """
     table = strengths[pair_of].fill_diagonal_(-math.inf)
-    order = [0]
-    left = list(range(1, len(table)))
+    order = [root]
+    left = [camera for camera in range(len(table)) if camera != root]
     while left:
         reach = [float(table[order, camera].max()) for camera in left]
         order.append(left.pop(reach.index(max(reach))))
     return order
 
 
-def _grow(energies: PairEnergies, distributions: PairDistributions, settings: AscentSettings) -> torch.Tensor:
+def _grow(
+    energies: PairEnergies, distributions: PairDistributions, root: int, settings: AscentSettings
+) -> torch.Tensor:
     """A beam of complete starts. -> (B, N, 3, 3)."""
-    order = spanning_order(distributions.mode_log_densities[:, 0], energies.pair_of)
+    order = spanning_order(distributions.mode_log_densities[:, 0], energies.pair_of, root)
     beam = torch.eye(3, dtype=torch.float64).expand(1, energies.views, 3, 3).clone()
     scores = torch.zeros(1, dtype=torch.float64)
     for position in range(1, len(order)):
@@ -211,30 +215,59 @@ def _jump(
     rotations: torch.Tensor,
     settings: AscentSettings,
 ) -> torch.Tensor:
-    """Moves every camera in turn to the best hill that a mode of one of its pairs leads up to.
+    """Moves every camera in turn to the best hill, wherever it is. (S, N, 3, 3) -> (S, N, 3, 3).
 
-    The modes only say where to start: what all pairs of a camera agree on may be the top of none of them.
-    (S, N, 3, 3) -> (S, N, 3, 3).
+    Modes of its pairs and cells of the coarse grid only say where to start climbing: what all pairs of a
+    camera agree on may be the top of none of them.
     """
     rotations = rotations.clone()
+    rows = torch.arange(len(rotations))
     for camera in range(energies.views):
         others = [other for other in range(energies.views) if other != camera]
-        modes = _mode_candidates(energies, distributions, rotations, camera, others)
-        candidates = torch.cat([rotations[:, camera, None], modes], 1)
-        gains = _conditional(energies, rotations, camera, others, candidates)
-        for row in range(len(rotations)):
-            keep = _distinct(candidates[row][:, None], gains[row], settings.hops, settings.distinct)
-            here = rotations[row : row + 1]
-            hills, heights = ascend(
-                lambda each: _conditional(energies, here, camera, others, each[None])[0],
-                candidates[row][keep],
-                settings.climb_stride,
-                settings.hop_steps,
-            )
-            best = heights.argmax()
-            if heights[best] > gains[row, 0]:
-                rotations[row, camera] = hills[best]
+        here = rotations[:, camera, None]
+        modes = torch.cat([here, _mode_candidates(energies, distributions, rotations, camera, others)], 1)
+        gains = _conditional(energies, rotations, camera, others, modes)
+        cells = distributions.coarse_rotations.expand(len(rotations), -1, -1, -1)
+        guesses = _coarse_conditional(energies, distributions, rotations, camera, others)
+        starts = torch.cat(
+            [
+                peaks(modes, gains, settings.hops, settings.distinct)[0],
+                peaks(cells, guesses, settings.hops, settings.distinct)[0],
+            ],
+            1,
+        )
+
+        def height(places: torch.Tensor) -> torch.Tensor:
+            return _conditional(energies, rotations, camera, others, places.view_as(starts)).flatten()
+
+        hills, heights = ascend(height, starts.flatten(0, 1), settings.climb_stride, settings.hop_steps)
+        hills = torch.cat([here, hills.view_as(starts)], 1)
+        heights = torch.cat([gains[:, :1], heights.view(starts.shape[:2])], 1)
+        rotations[:, camera] = hills[rows, heights.argmax(1)]
     return rotations
+
+
+def _coarse_conditional(
+    energies: PairEnergies,
+    distributions: PairDistributions,
+    rotations: torch.Tensor,
+    camera: int,
+    others: list[int],
+) -> torch.Tensor:
+    """What the coarse grid remembers of `_conditional`, for the camera at each of its cells. -> (S, C).
+
+    No energy is evaluated: each relative rotation takes the value of the cell that it falls nearest to.
+    """
+    cells = distributions.coarse_rotations
+    flat = cells.flatten(1).float()
+    totals = torch.zeros(len(rotations), len(cells), dtype=torch.float64)
+    for other in others:
+        relative = cells @ rotations[:, other, None].mT  # (S, C, 3, 3)
+        if camera < other:
+            relative = relative.mT
+        nearest = (relative.flatten(2).float() @ flat.T).argmax(-1)
+        totals += distributions.coarse[energies.pair_of[camera, other]][nearest]
+    return totals
 
 
 def _sweep(energies: PairEnergies, rotations: torch.Tensor, radius: float) -> torch.Tensor:

@@ -31,7 +31,7 @@ class SearchSettings:
     """The level evaluated in full: 72 * 8^level cells a pair, 30 degrees apart at level 1."""
     widths: tuple[int, ...] = (64, 64)
     """Cells split at that level and at each one below it."""
-    modes: int = 4
+    modes: int = 8
     """Modes looked for a pair."""
     separation: float = math.radians(25)
     """Modes nearer than this are one, rad: the cells of the coarse level are that far apart."""
@@ -51,6 +51,10 @@ class PairDistributions:
     """(L,) log of the share of SO(3) that a cell fills; the same for every pair."""
     spacings: torch.Tensor
     """(L,) edge of a cell, rad."""
+    coarse: torch.Tensor
+    """(P, C) highest energy met in each cell of the coarse level, whose centres are ``coarse_rotations``."""
+    coarse_rotations: torch.Tensor
+    """(C, 3, 3)."""
     modes: torch.Tensor
     """(P, M, 3, 3) local maxima, highest energy first."""
     mode_energies: torch.Tensor
@@ -77,14 +81,18 @@ def search(
     level = settings.level
     cells = torch.arange(so3_grid.size(level)).expand(energies.count, -1)
     values = energies.on_grid(grid(level))
+    coarse = values.double()
+    ancestors = cells
     kept: list[tuple[int, torch.Tensor, torch.Tensor]] = []
     for width in settings.widths:
         values, order = torch.sort(values, dim=1, descending=True, stable=True)
-        cells = torch.gather(cells, 1, order)
+        cells, ancestors = torch.gather(cells, 1, order), torch.gather(ancestors, 1, order)
         kept.append((level, cells[:, width:], values[:, width:]))
         cells = (cells[:, :width, None] * 8 + torch.arange(8)).flatten(1)
+        ancestors = ancestors[:, :width].repeat_interleave(8, 1)
         level += 1
         values = energies.on_cells(grid(level), cells)
+        coarse = coarse.scatter_reduce(1, ancestors, values.double(), "amax")
     kept.append((level, cells, values))
 
     rotations = torch.cat([_grid_tensor(at)[index] for at, index, _ in kept], 1)
@@ -92,31 +100,45 @@ def search(
     levels = [at for at, index, _ in kept for _ in range(index.shape[1])]
     log_volumes = torch.tensor([-math.log(so3_grid.size(at)) for at in levels], dtype=torch.float64)
     spacings = torch.tensor([so3_grid.cell_spacing(at) for at in levels], dtype=torch.float64)
-    peaks = _peaks(rotations, scores, settings)
-    modes, mode_energies = _refine_modes(energies, *peaks, so3_grid.cell_spacing(level), settings)
-    return PairDistributions(rotations, scores, log_volumes, spacings, modes, mode_energies)
+    tops = peaks(rotations, scores, settings.modes, settings.separation)
+    modes, mode_energies = _refine_modes(energies, *tops, so3_grid.cell_spacing(level), settings)
+    coarse_rotations = _grid_tensor(settings.level)
+    return PairDistributions(
+        rotations, scores, log_volumes, spacings, coarse, coarse_rotations, modes, mode_energies
+    )
 
 
 def _grid_tensor(level: int) -> torch.Tensor:
     return torch.from_numpy(np.array(so3_grid.grid(level)))
 
 
-def _peaks(
-    rotations: torch.Tensor, energies: torch.Tensor, settings: SearchSettings
+def peaks(
+    rotations: torch.Tensor, values: torch.Tensor, count: int, separation: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The highest cells that lie at least `separation` apart. -> (P, M, 3, 3), (P, M)."""
-    least_trace = 1 + 2 * math.cos(settings.separation)
+    """The highest of some rotations, in each row, of which no two are nearer than ``separation``.
+
+    Args:
+        rotations: (P, L, 3, 3).
+        values: (P, L).
+        count: M, how many to pick in each row.
+        separation: rad.
+
+    Returns:
+        Rotations (P, M, 3, 3), highest first, and values (P, M), -inf where a row has no more.
+    """
+    least_trace = 1 + 2 * math.cos(separation)
     flat = rotations.flatten(2)  # (P, L, 9): the trace of A B^T is their scalar product
-    left = energies.clone()
+    left = values.clone()
     rows = torch.arange(len(flat))
-    peaks, values = [], []
-    for _ in range(settings.modes):
+    tops, heights = [], []
+    for _ in range(count):
         best = left.argmax(1)
-        peaks.append(rotations[rows, best])
-        values.append(left[rows, best])
+        tops.append(rotations[rows, best])
+        heights.append(left[rows, best])
         traces = torch.einsum("pla,pa->pl", flat, flat[rows, best])
         left = left.masked_fill(traces > least_trace, -math.inf)
-    return torch.stack(peaks, 1), torch.stack(values, 1)
+        left[rows, best] = -math.inf
+    return torch.stack(tops, 1), torch.stack(heights, 1)
 
 
 def _refine_modes(
