@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from relpose_ros.captures import shaders
 from relpose_ros.errors import RelPoseError
 
 if TYPE_CHECKING:
@@ -30,170 +31,12 @@ _SHADOW_SIZE = 512
 _SHADOW_REACH = 2.2
 """Half width of the shadow map, object radii."""
 _CONTACT_SIZE = 64
-_CONTACT_REACH = 1.7
 _VERTEX_FLOATS = 11
 _MIRROR_SIZE = 64
 _UNITS = ("surfaces", "panorama", "mirrored", "shadow_map", "contact")
 """Texture units, in order."""
 _GLOSSY = 0.02
 """Below it a part reflects nothing worth drawing."""
-
-_SURFACE_VERTEX = """
-#version 330
-uniform mat4 clip_from_world;
-uniform mat3 world_from_local;
-in vec3 position;
-in vec3 normal;
-in vec2 uv;
-in vec3 material;
-out vec3 world;
-out vec3 turned;
-out vec3 texel;
-out vec2 finish;
-void main() {
-    world = world_from_local * position;
-    turned = world_from_local * normal;
-    texel = vec3(uv, material.x);
-    finish = material.yz;
-    gl_Position = clip_from_world * vec4(world, 1.0);
-}
-"""
-
-# Colours are squared on the way in and rooted on the way out: near enough to the sRGB curve.
-# What a part does not need is compiled out: software OpenGL runs both sides of every branch.
-_SURFACE_FRAGMENT = """
-#version 330
-#define FEATURES
-const float PI = 3.14159265;
-uniform sampler2DArray surfaces;
-uniform sampler2D mirrored;
-uniform sampler2DShadow shadow_map;
-uniform sampler2D contact;
-uniform mat4 shadow_from_world;
-uniform mat3 object_from_world;
-uniform vec3 camera;
-uniform vec3 to_light;
-uniform vec3 key;
-uniform vec3 ambient[9];
-uniform float shadow;
-uniform float ground_z;
-uniform float sharpness;
-in vec3 world;
-in vec3 turned;
-in vec3 texel;
-in vec2 finish;
-out vec4 colour;
-
-vec3 light_onto(vec3 n) {
-    return ambient[0] + ambient[1] * n.y + ambient[2] * n.z + ambient[3] * n.x
-        + ambient[4] * (n.x * n.y) + ambient[5] * (n.y * n.z) + ambient[6] * (3.0 * n.z * n.z - 1.0)
-        + ambient[7] * (n.x * n.z) + ambient[8] * (n.x * n.x - n.y * n.y);
-}
-
-vec3 light_from(vec3 direction, float level) {
-    vec3 d = direction / (abs(direction.x) + abs(direction.y) + abs(direction.z));
-    vec2 folded = (1.0 - abs(d.yx)) * vec2(d.x < 0.0 ? -1.0 : 1.0, d.y < 0.0 ? -1.0 : 1.0);
-    vec3 seen = textureLod(mirrored, (d.z < 0.0 ? folded : d.xy) * 0.5 + 0.5, level).rgb;
-    return seen * seen;
-}
-
-void main() {
-    vec3 base = texture(surfaces, texel, sharpness).rgb;
-    vec3 n = normalize(turned);
-    vec3 eye = normalize(camera - world);
-    n = dot(n, eye) < 0.0 ? -n : n;
-#ifdef RELIEF
-    float height = (base.r + base.g + base.b) * 0.333 * finish.y;
-    vec3 px = dFdx(world), py = dFdy(world);
-    vec3 across = cross(py, n), down = cross(n, px);
-    float area = dot(px, across);
-    n = normalize((abs(area) + 1e-9) * n - sign(area) * (dFdx(height) * across + dFdy(height) * down));
-#endif
-    float lit = max(dot(n, to_light), 0.0);
-#ifdef SHADOW
-    lit *= 1.0 - shadow * (1.0 - texture(shadow_map, (shadow_from_world * vec4(world + n * 0.02, 1.0)).xyz));
-#endif
-    vec3 diffuse = light_onto(n);
-    float above = max(world.z - ground_z, 0.0);
-#ifdef OBJECT
-    // What is near the ground and faces it sees less of the room.
-    diffuse *= 1.0 - 0.45 * exp2(-7.0 * above) * (0.6 - 0.4 * n.z);
-#else
-    vec2 beneath = (object_from_world * world).xy / (2.0 * CONTACT_REACH) + 0.5;
-    float dark = texture(contact, beneath).r * exp2(-8.0 * above);
-    diffuse *= 1.0 - 0.85 * dark;
-    lit *= 1.0 - 0.5 * dark;
-#endif
-    vec3 result = base * base * (key * lit + max(diffuse, 0.0));
-#ifdef GLOSS
-    float facing = max(dot(n, eye), 0.0), away = 1.0 - facing;
-    float edge = 0.04 + 0.96 * away * away * away * away * away;
-    float spot = exp2((dot(n, normalize(to_light + eye)) - 1.0) * 1.44 * exp2(3.0 + 6.0 * finish.x));
-    result += key * lit * finish.x * spot * 0.8;
-    result += finish.x * (0.08 + edge) * light_from(reflect(-eye, n), (1.0 - finish.x) * 4.0);
-#endif
-#ifdef OBJECT
-    const float coverage = 1.0;
-#else
-    const float coverage = 0.0;
-#endif
-    colour = vec4(sqrt(result / (1.0 + 0.25 * dot(result, vec3(0.33)))), coverage);
-}
-""".replace("CONTACT_REACH", str(_CONTACT_REACH))
-
-_BACKDROP_VERTEX = """
-#version 330
-uniform mat3 ray_from_pixel;
-in vec2 corner;
-out vec3 ray;
-void main() {
-    ray = ray_from_pixel * vec3(corner, 1.0);
-    gl_Position = vec4(corner, 1.0, 1.0);
-}
-"""
-
-_BACKDROP_FRAGMENT = """
-#version 330
-const float PI = 3.14159265;
-uniform sampler2D panorama;
-uniform vec3 camera;
-uniform vec3 room_half;
-uniform vec3 eye;
-uniform float level;
-in vec3 ray;
-out vec4 colour;
-void main() {
-    vec3 way = normalize(ray) + vec3(1e-6);
-    vec3 walls = (sign(way) * room_half - camera) / way;
-    vec3 hit = normalize(camera + min(walls.x, min(walls.y, walls.z)) * way - eye);
-    vec2 place = vec2(atan(hit.y, hit.x) / (2.0 * PI) + 0.5, acos(clamp(hit.z, -1.0, 1.0)) / PI);
-    colour = vec4(textureLod(panorama, place, level).rgb, 0.0);
-}
-"""
-
-_PLAIN_VERTEX = """
-#version 330
-uniform mat4 clip_from_local;
-in vec3 position;
-out vec3 local;
-void main() {
-    local = position;
-    gl_Position = clip_from_local * vec4(position, 1.0);
-}
-"""
-
-_PLACE_FRAGMENT = """
-#version 330
-uniform float is_object;
-in vec3 local;
-out vec4 place;
-void main() { place = vec4(local, is_object); }
-"""
-
-_EMPTY_FRAGMENT = """
-#version 330
-void main() {}
-"""
 
 
 class RenderError(RelPoseError):
@@ -230,9 +73,9 @@ class Renderer:
             raise RenderError(text) from err
         gl = self._gl
         self._surfaces: dict[tuple[str, ...], moderngl.Program] = {}
-        self._backdrop = gl.program(_BACKDROP_VERTEX, _BACKDROP_FRAGMENT)
-        self._place = gl.program(_PLAIN_VERTEX, _PLACE_FRAGMENT)
-        self._depth = gl.program(_PLAIN_VERTEX, _EMPTY_FRAGMENT)
+        self._backdrop = gl.program(shaders.BACKDROP_VERTEX, shaders.BACKDROP_FRAGMENT)
+        self._place = gl.program(shaders.PLAIN_VERTEX, shaders.PLACE_FRAGMENT)
+        self._depth = gl.program(shaders.PLAIN_VERTEX, shaders.EMPTY_FRAGMENT)
         _set(self._backdrop, "panorama", _UNITS.index("panorama"))
         quad = np.array([[-1, -1], [3, -1], [-1, 3]], np.float32)
         self._everywhere = gl.vertex_array(self._backdrop, [(gl.buffer(quad.tobytes()), "2f", "corner")])
@@ -303,7 +146,7 @@ class Renderer:
         if features not in self._surfaces:
             defines = "\n".join(f"#define {name}" for name in features)
             program = self._gl.program(
-                _SURFACE_VERTEX, _SURFACE_FRAGMENT.replace("#define FEATURES", defines)
+                shaders.SURFACE_VERTEX, shaders.SURFACE_FRAGMENT.replace("#define FEATURES", defines)
             )
             for unit, name in enumerate(_UNITS):
                 _set(program, name, unit)
@@ -628,7 +471,7 @@ def _contact(scene: Scene) -> npt.NDArray[np.uint8]:
         weight = rng.dirichlet((1, 1, 1), 1500)[..., None]
         points = (chosen * weight).sum(1)
         cell = (
-            ((points[:, :2] / (2 * _CONTACT_REACH) + 0.5) * _CONTACT_SIZE)
+            ((points[:, :2] / (2 * shaders.CONTACT_REACH) + 0.5) * _CONTACT_SIZE)
             .astype(int)
             .clip(0, _CONTACT_SIZE - 1)
         )

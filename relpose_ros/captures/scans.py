@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -114,9 +114,7 @@ class ScanRenderer:
             crops=np.array(crops),
             image_sizes=np.array(sizes),
             camera_from_object=np.stack([shot.camera_from_object for shot in scene.shots]),
-            intrinsics=np.array(
-                [[getattr(s.intrinsics, f.name) for f in fields(s.intrinsics)] for s in scene.shots]
-            ),
+            intrinsics=np.array([astuple(shot.intrinsics) for shot in scene.shots]),
             places=places,
             complete=np.array([shot.complete for shot in scene.shots]),
             symmetry=scene.thing.symmetry,
