@@ -13,6 +13,8 @@ unexport PYTHONHOME PYTHONOPTIMIZE PYTHONPATH PYTHONSAFEPATH
 INSTALLED := CMakeLists.txt constraints.txt package.xml pyproject.toml setup.py \
 	$(filter-out %/__pycache__,$(wildcard build_support/* config/* launch/* msg/*))
 
+BENCHMARKS := $(basename $(notdir $(shell grep -l __main__ benchmarks/*.py)))
+
 .PHONY: setup demo test lint bench train evaluate bags clean check
 
 setup: $(VENV)/.relpose_ros-installed
@@ -28,9 +30,18 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-# Each folder of captures or bag, each option: make train ARGS="..."
+# What the command takes goes into ARGS: make evaluate ARGS="captures/*"
 train evaluate: setup
 	$(BIN)/relpose_ros $@ $(ARGS)
+
+bench: setup
+	@for each in $(BENCHMARKS); do echo "benchmarks/$$each.py"; $(BIN)/python -m benchmarks.$$each || exit; done
+
+# Rendered beside them first: where there is no OpenGL, the recorded ones stay.
+bags: setup
+	@rm -rf out/bags
+	$(BIN)/relpose_ros render out/bags --as demo-bags
+	@for each in out/bags/*; do rm -rf bags/$${each##*/} && mv $$each bags/ || exit; done
 
 clean:
 	rm -rf build dist install log out *.egg-info .coverage .mypy_cache .pytest_cache .ruff_cache
