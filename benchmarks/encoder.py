@@ -27,7 +27,8 @@ from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-HEADER = f"{'preset':8} {'N':>2}  {'all views, s':>20}  {'one view more, s':>20}  {'all pairs, s':>20}  {'peak, MiB':>9}"
+COLUMNS = ("all views, s", "one view more, s", "all pairs, s")
+HEADER = f"{'preset':8} {'N':>2}  {'  '.join(f'{column:>20}' for column in COLUMNS)}  peak, MiB"
 
 
 def timed(call: Callable[[], object], repeats: int) -> tuple[float, float]:
@@ -88,22 +89,13 @@ def main() -> None:
         for name in arguments.presets:
             rows(name, arguments.repeats)
         return
-    print(
-        f"torch {torch.__version__}, {platform.machine()}, {arguments.threads} threads; least (median) seconds of"
-    )
-    print(f"{arguments.repeats} after one to warm up; random weights, float32\n")
+    print(f"torch {torch.__version__}, {platform.machine()}, {arguments.threads} threads, float32;")
+    print(f"least (median) seconds of {arguments.repeats} after one to warm up\n")
     print(HEADER, flush=True)
     for name in arguments.presets:
-        own = [
-            "--rows",
-            "--presets",
-            name,
-            "--threads",
-            str(arguments.threads),
-            "--repeats",
-            str(arguments.repeats),
-        ]
-        subprocess.run([sys.executable, "-m", "benchmarks.encoder", *own], check=True)
+        numbers = ["--threads", str(arguments.threads), "--repeats", str(arguments.repeats)]
+        own = [sys.executable, "-m", "benchmarks.encoder", "--rows", "--presets", name, *numbers]
+        subprocess.run(own, check=True)
 
 
 if __name__ == "__main__":
