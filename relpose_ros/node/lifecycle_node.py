@@ -36,7 +36,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from relpose_ros.errors import RelPoseError
 from relpose_ros.msg import ObjectView, ScanEstimate
 from relpose_ros.node.parameters import changed_settings, declare_parameters
-from relpose_ros.node.reports import NodeHealth, Throttle, diagnostic_status, qos_advice
+from relpose_ros.node.reports import NodeHealth, Throttle, diagnostic_status, loss_advice, qos_advice
 from relpose_ros.scanning.scanner import Scanner
 from relpose_ros.scanning.settings import SettingsError
 
@@ -51,6 +51,8 @@ if TYPE_CHECKING:
 
 BURST = 50
 """Messages that a subscription keeps while the callbacks are busy with others."""
+LOSS_REPEAT_AFTER_S = 60.0
+"""Lost messages are told this often: a scan can do with some of a camera's frames."""
 
 INPUTS: tuple[tuple[Kind, str, Any, str], ...] = (
     ("object_view", "object_view", ObjectView, ""),
@@ -131,7 +133,9 @@ class ScanNode(LifecycleNode):
         self._incompatible: dict[str, tuple[bool, str]] = {}
         self._longest_callback_s: dict[str, float] = {}
         self._publishers_of: dict[str, int] = {}
+        self._lost: dict[str, int] = {}
         self._throttle = Throttle()
+        self._loss_throttle = Throttle(LOSS_REPEAT_AFTER_S)
         # A service that waits for an estimate must not hold up the callbacks of images.
         self._waiting_group = MutuallyExclusiveCallbackGroup()
         self._diagnostics = self.create_publisher(
@@ -243,11 +247,11 @@ class ScanNode(LifecycleNode):
     # What configuring makes.
 
     def _load_estimator(self) -> SupportsEstimate:
+        weights, threads = self._settings.weights, self._settings.threads
+        self.get_logger().info(f"Loading {weights or 'the shipped weights'}.")
         # Imported here, as is all that needs PyTorch: that takes seconds, in which a signal must be heard.
         from relpose_ros.inference.estimator import Estimator
 
-        weights, threads = self._settings.weights, self._settings.threads
-        self.get_logger().info(f"Loading {weights or 'the shipped weights'}.")
         return Estimator.from_weights(Path(weights) if weights else None, threads or None)
 
     def _make_outputs(self) -> None:
@@ -272,6 +276,7 @@ class ScanNode(LifecycleNode):
             events = SubscriptionEventCallbacks(
                 incompatible_qos=functools.partial(self._on_incompatible_qos, topic, True),
                 matched=functools.partial(self._on_matched, topic),
+                message_lost=functools.partial(self._on_message_lost, topic),
             )
             self._publishers_of[topic] = 0
             subscription = self.create_subscription(
@@ -302,6 +307,7 @@ class ScanNode(LifecycleNode):
         self._incompatible.clear()
         self._longest_callback_s.clear()
         self._publishers_of.clear()
+        self._lost.clear()
 
     # Messages in.
 
@@ -334,6 +340,13 @@ class ScanNode(LifecycleNode):
 
     def _on_matched(self, topic: str, event: Any) -> None:
         self._publishers_of[topic] = event.current_count
+
+    def _on_message_lost(self, topic: str, event: Any) -> None:
+        self._lost[topic] = event.total_count
+        if self._active:
+            line = self._loss_throttle.pass_on(topic, loss_advice(topic, event.total_count))
+            if line is not None:
+                self.get_logger().warning(line)
 
     # Estimates out: the worker's side.
 
@@ -490,6 +503,7 @@ class ScanNode(LifecycleNode):
             failure=self._failure,
             failing=self._failing,
             publishers=dict(self._publishers_of),
+            lost=dict(self._lost),
             longest_callbacks_s=dict(self._longest_callback_s),
             incompatible=self._incompatible_now(),
         )

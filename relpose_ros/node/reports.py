@@ -93,6 +93,15 @@ def qos_advice(topic: str, kind: QoSPolicyKind, *, subscribing: bool) -> str:
     )
 
 
+def loss_advice(topic: str, lost: int) -> str:
+    """What to do about messages that were sent and never came, which best effort allows."""
+    parameter = f"qos_overrides.{topic}.subscription.reliability"
+    return (
+        f"{topic}: messages are lost on the way, {lost} so far. Where the publisher is reliable, set this "
+        f"node's parameter {parameter} to reliable; compressed images are lost less easily."
+    )
+
+
 @dataclass(frozen=True)
 class NodeHealth:
     """What the node knows of itself, beside its scanner's statistics."""
@@ -105,6 +114,8 @@ class NodeHealth:
     """Whether the last estimate ended in an error."""
     publishers: Mapping[str, int] = field(default_factory=dict)
     """How many of them each topic listens to: none is why nothing arrives."""
+    lost: Mapping[str, int] = field(default_factory=dict)
+    """Messages that were sent and never came, by topic."""
     longest_callbacks_s: Mapping[str, float] = field(default_factory=dict)
     """The slowest callback so far, by topic."""
     incompatible: Mapping[str, str] = field(default_factory=dict)
@@ -126,6 +137,7 @@ def diagnostic_status(name: str, health: NodeHealth, statistics: Statistics | No
     values = [("state", health.state)]
     values += ((f"{topic} QoS", advice) for topic, advice in health.incompatible.items())
     values += ((f"{topic} publishers", str(count)) for topic, count in health.publishers.items())
+    values += ((f"{topic} lost", str(count)) for topic, count in health.lost.items())
     for topic, seconds in health.longest_callbacks_s.items():
         values.append((f"{topic} slowest callback ms", f"{1e3 * seconds:.2f}"))
     if statistics is not None:

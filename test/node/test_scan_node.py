@@ -213,6 +213,8 @@ def test_how_long_a_full_hd_frame_holds_the_callbacks(node: Any, graph: Any, mak
 
     graph.wait_until(estimated, "an estimate of two frames")
     received, sent = graph.count(IMAGE, "received") - before, next(stamps) - 10
+    if received < sent - 1:
+        node.wait_for("WARN", f"qos_overrides.{IMAGE}.subscription.reliability to reliable")
     slowest = graph.diagnostic(f"{IMAGE} slowest callback ms")
     print(f"1920x1080 rgb8, {received} of {sent} frames got through: slowest callback {slowest} ms")
 
@@ -255,6 +257,7 @@ def test_transitions(node: Any, graph: Any, make: Any, tmp_path: Path) -> None:
     assert stamp_s(graph.estimate_of("mug", views=4)) == 23.0
 
 
-def test_it_leaves_with_zero(running: Any) -> None:
+def test_it_leaves_with_zero_whatever_it_does(running: Any, graph: Any, make: Any) -> None:
+    graph.publish(OBJECT_VIEW, *(make.object_view(100.0 + k, "mug") for k in range(8)))
     assert running.end() == 0
     assert not running.told("Traceback"), list(running.lines)
