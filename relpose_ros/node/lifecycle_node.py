@@ -167,7 +167,8 @@ class ScanNode(LifecycleNode):
         try:
             if self._worker is not None:
                 self._worker.shutdown(wait=False, cancel_futures=True)
-            return not wait(self._jobs, max(0.0, deadline - time.monotonic())).not_done
+            under_way = [job for job in self._jobs if not job.cancelled()]
+            return not wait(under_way, max(0.0, deadline - time.monotonic())).not_done
         finally:
             self.in_transition.release()
 
@@ -303,6 +304,7 @@ class ScanNode(LifecycleNode):
             self.destroy_lifecycle_publisher(publisher)
         self._inputs, self._services_of_scan, self._outputs = [], [], {}
         self._worker = self._scanner = self._jump = None
+        self._jobs = set()
         self._estimate_asked = self._failing = False
         self._incompatible.clear()
         self._longest_callback_s.clear()
