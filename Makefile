@@ -47,18 +47,22 @@ clean:
 	rm -rf build dist install log out *.egg-info .coverage .mypy_cache .pytest_cache .ruff_cache
 	find relpose_ros test -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# A stamp is written last, so that whatever was interrupted is done again.
+# A stamp is written last, so that whatever was interrupted is done again. pip writes RECORD last: it takes a package
+# without one for installed, unless its dist-info is gone.
+pip_install = for each in $(VENV)/lib/python*/site-packages/*.dist-info; do \
+		test -f $$each/RECORD || rm -rf $$each; done; \
+	$(BIN)/python -m pip install -qq --constraint constraints.txt
+
 $(VENV)/.relpose_ros-build-tools: build_support/requirements.txt constraints.txt
 	@$(MAKE) --no-print-directory check
 	@echo "Setting up $(VENV): a few minutes the first time."
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install -qq --constraint constraints.txt --requirement build_support/requirements.txt
+	@$(pip_install) --requirement build_support/requirements.txt
 	@touch $@
 
 $(VENV)/.relpose_ros-installed: $(VENV)/.relpose_ros-build-tools $(INSTALLED)
 	@echo "Installing relpose_ros into $(VENV)."
-	@$(BIN)/python -m pip install -qq --constraint constraints.txt --no-build-isolation \
-		--editable '.[ros,train,evaluate,dev]'
+	@$(pip_install) --no-build-isolation --editable '.[ros,train,evaluate,dev]'
 	@touch $@
 
 # missing(condition, sentence): where the condition fails, the sentence is all that make says.
