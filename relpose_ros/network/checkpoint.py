@@ -56,7 +56,7 @@ class NetworkFileError(RelPoseError):
 
 
 def load_network(path: Path | str | None = None) -> RelPose:
-    """The network of a weights file, on the CPU in float32 and in eval mode.
+    """The network of a weights file, ready to use: on the CPU, float32, in eval mode, without gradients.
 
     Args:
         path: a safetensors file or a released checkpoint; None for the weights that ship with the package.
@@ -77,7 +77,7 @@ def load_network(path: Path | str | None = None) -> RelPose:
         for name, tensor in tensors.items()
     }
     network.load_state_dict(state, strict=True, assign=True)
-    return network.eval()
+    return network.eval().requires_grad_(requires_grad=False)
 
 
 def read_metadata(path: Path | str | None = None) -> dict[str, str]:

@@ -65,6 +65,7 @@ def test_a_released_checkpoint_loads_and_converts_to_the_same_network(
     assert same_weights(loaded, compact)
     assert loaded.preset == PRESETS["compact"]
     assert not loaded.training
+    assert not any(parameter.requires_grad for parameter in loaded.parameters())
     written = checkpoint.convert(source, target)
     assert written == checkpoint.read_metadata(target)
     assert written["preset"] == "compact"
