@@ -1,4 +1,4 @@
-"""The backbone looks at each view once, however often its scan is estimated, and forgets views that are gone."""
+"""The backbone looks at each view once, however often its scan is estimated, and keeps no view alive."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import weakref
 from typing import TYPE_CHECKING
 
 import numpy as np
+
 from relpose_ros.inference.estimator import Estimator
 from relpose_ros.network.checkpoint import random_network
 from relpose_ros.views import BoundingBox, Scan, View
