@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from relpose_ros.network.backbone import group_norm
+
 if TYPE_CHECKING:
     from relpose_ros.network.presets import CorrelationSettings
 
@@ -54,13 +56,18 @@ class CorrelationReader(nn.Module):
         self.claimed_by = nn.Parameter(_cosine_basis(self.side, values))
         self.read_layout = nn.Sequential(
             nn.Conv2d(2 * values + 1, layout[0], 1),
+            group_norm(layout[0]),
             nn.LeakyReLU(),
             nn.Conv2d(layout[0], layout[0], 3, stride=2, padding=1),
+            group_norm(layout[0]),
             nn.LeakyReLU(),
             nn.Conv2d(layout[0], layout[1], 3, stride=2, padding=1),
+            group_norm(layout[1]),
             nn.LeakyReLU(),
             nn.Flatten(),
             nn.Linear(layout[1] * quarter, settings.summary_width),
+            # Without a norm training lets summaries grow until the rotation beside them is lost in rounding.
+            nn.LayerNorm(settings.summary_width),
             nn.LeakyReLU(),
             nn.Linear(settings.summary_width, width),
         )

@@ -27,6 +27,10 @@ FIELDS = ("images", "crop_parameters", "camera_from_object", "places", "image_si
 """What is used of a shard; see `relpose_ros.captures.shards`."""
 
 
+DRAWS = 20
+"""How often another scan is drawn when one lacks views within the angle asked for."""
+
+
 class ShardError(RelPoseError):
     """A folder holds no shards, or shards of another kind."""
 
@@ -102,10 +106,10 @@ class Augmentation:
 
 def choose_views(
     camera_from_object: FloatArray, count: int, max_angle: float, generator: np.random.Generator
-) -> list[int]:
+) -> tuple[list[int], bool]:
     """Views of a scan whose viewing directions lie within an angle of a random one's, in random order.
 
-    Where too few do, the nearest are taken.
+    Where too few do, the nearest are taken, and the second value is False.
 
     Args:
         camera_from_object: (M, 3, 4).
@@ -117,10 +121,10 @@ def choose_views(
     anchor = int(generator.integers(len(directions)))
     angles = np.degrees(np.arccos(np.clip(directions @ directions[anchor], -1, 1)))
     angles[anchor] = -1
-    within = max(count - 1, int((angles <= max_angle).sum()) - 1)
-    near = np.argsort(angles, kind="stable")[1 : 1 + within]
+    within = int((angles <= max_angle).sum()) - 1
+    near = np.argsort(angles, kind="stable")[1 : 1 + max(within, count - 1)]
     others = generator.choice(near, count - 1, replace=False)
-    return [int(k) for k in generator.permutation([anchor, *others])]
+    return [int(k) for k in generator.permutation([anchor, *others])], within >= count - 1
 
 
 def make_batch(
@@ -142,9 +146,12 @@ def make_batch(
         augmentation: None for the scans as they are.
     """
     rows = []
-    for index in generator.integers(len(scans), size=count):
-        row = scans.row(int(index))
-        chosen = choose_views(row["camera_from_object"], views, max_angle, generator)
+    for _ in range(count):
+        for _ in range(DRAWS):
+            row = scans.row(int(generator.integers(len(scans))))
+            chosen, within = choose_views(row["camera_from_object"], views, max_angle, generator)
+            if within:
+                break
         scan = _Scan(
             images=np.asarray(row["images"][chosen], np.float32) / 255,
             places=np.asarray(row["places"][chosen], np.float32),
@@ -202,8 +209,9 @@ def _recolour(scan: _Scan, augmentation: Augmentation, generator: np.random.Gene
         changed += noise * generator.standard_normal(changed.shape, np.float32)
     outside = scan.images.max(-1, keepdims=True) == 0  # beside the photograph a crop is black in any light
     changed = np.clip(np.where(outside, 0, changed), 0, 1)
-    if generator.random() < augmentation.masked:
-        seen = torch.from_numpy(np.isfinite(scan.places[..., 0])).float()[:, None]
+    object_cells = np.isfinite(scan.places[..., 0])
+    if generator.random() < augmentation.masked and object_cells.any():
+        seen = torch.from_numpy(object_cells).float()[:, None]
         mask = (
             functional.interpolate(seen, changed.shape[1:3], mode="bilinear", align_corners=False)[:, 0] > 0.4
         )

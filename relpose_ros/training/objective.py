@@ -241,12 +241,14 @@ class Objective(nn.Module):
             # Six numbers have no likelihood: the mean absolute error of the matrix, as for translations.
             rotation = translation_loss(network.optical_rotations(features), targets.rotations)
         else:
-            contexts = network.pair_contexts(features, targets.i, targets.j)
-            own = network.embed_relative(torch.cat([targets.true[:, :, None], targets.near], 2))
-            own_energies = network.pair_energies(contexts, own)
-            shared = network.pair_energies(contexts, network.embed_relative(targets.uniform))
-            energies = torch.cat([own_energies[..., :1], shared, own_energies[..., 1:]], -1)
-            rotation = rotation_loss(energies, targets.log_density)
+            contexts = network.pair_contexts(features, targets.i, targets.j).float()
+            # In full precision: energies of near rotations differ by less than half precision tells apart.
+            with torch.autocast(images.device.type, enabled=False):
+                own = network.embed_relative(torch.cat([targets.true[:, :, None], targets.near], 2))
+                own_energies = network.pair_energies(contexts, own)
+                shared = network.pair_energies(contexts, network.embed_relative(targets.uniform))
+                energies = torch.cat([own_energies[..., :1], shared, own_energies[..., 1:]], -1)
+                rotation = rotation_loss(energies, targets.log_density)
         matches = rotation.new_zeros(())
         if settings.match_weight > 0 and targets.places is not None and features.maps is not None:
             places = targets.places.flatten(2, 3)  # (B, N, A, 3)

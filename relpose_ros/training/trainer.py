@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import distributed
 from torch.nn.parallel import DistributedDataParallel
+from torch.utils.data import DataLoader, Dataset
 
 from relpose_ros.errors import RelPoseError
 from relpose_ros.geometry import so3, so3_grid
@@ -29,7 +30,7 @@ from relpose_ros.training.batches import Augmentation, Scans, make_batch
 from relpose_ros.training.objective import Batch, Objective, ObjectiveSettings, Targets, make_targets
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from relpose_ros.network.relpose import RelPose
@@ -111,6 +112,7 @@ class Trainer:
         held_out: Scans | None = None,
         *,
         device: str = "cpu",
+        workers: int = 0,
     ) -> None:
         """Begin a run, or go on with the one in the folder.
 
@@ -122,6 +124,7 @@ class Trainer:
             scans: To learn from.
             held_out: To measure on, other objects.
             device: Of this process.
+            workers: Processes beside this one that prepare batches; what they prepare does not depend on it.
 
         Raises:
             TrainingError: The checkpoint is damaged or of another network.
@@ -129,6 +132,8 @@ class Trainer:
         self.settings = settings
         self.folder = folder
         self._scans, self._held_out = scans, held_out
+        self._workers = workers
+        self._batches: Iterator[tuple[Batch, Targets]] | None = None
         self._device = torch.device(device)
         self._rank, self._processes = _join(self._device)
         folder.mkdir(parents=True, exist_ok=True)
@@ -145,6 +150,7 @@ class Trainer:
                 {"params": plain, "weight_decay": 0.0},
             ],
             lr=settings.learning_rate,
+            betas=(0.9, 0.98),  # a longer memory of squared gradients let early steps run away
         )
         self._scaler = torch.amp.GradScaler(enabled=settings.precision == "float16")
         objective = Objective(self.network, settings.objective)
@@ -211,16 +217,8 @@ class Trainer:
         rate = self.learning_rate()
         for group in self._optimizer.param_groups:
             group["lr"] = rate
-        # The same number of views on every process, so that none waits for another.
-        views = int(
-            np.random.default_rng([settings.seed, self.step]).integers(
-                settings.min_views, settings.max_views + 1
-            )
-        )
-        generator = np.random.default_rng([settings.seed, self.step, self._rank])
-        scans = max(1, settings.batch_images // views)
-        batch = make_batch(self._scans, scans, views, self.max_angle(), generator, settings.augmentation)
-        losses = self._losses(batch, generator)
+        batch, targets = self._next_batch()
+        losses = self._losses(batch, targets)
         self._optimizer.zero_grad()
         torch.autograd.backward(self._scaler.scale(losses[0]))
         self._scaler.unscale_(self._optimizer)
@@ -228,7 +226,7 @@ class Trainer:
         self._scaler.step(self._optimizer)
         self._scaler.update()
         self.step += 1
-        seen = scans * views * self._processes
+        seen = batch.images.shape[0] * batch.images.shape[1] * self._processes
         self.images += seen
         # Young weights are forgotten sooner, or the average would keep the random ones.
         keep = min(self.step / (self.step + 10), float(np.exp(-seen / settings.average_images)))
@@ -245,8 +243,7 @@ class Trainer:
 
     def max_angle(self) -> float:
         """Largest angle between views and the one they surround, for the coming step, degrees."""
-        share = self.images / self.settings.images
-        return max(((start, angle) for start, angle in self.settings.curriculum if start <= share))[1]
+        return _max_angle(self.settings, self.images)
 
     def measure(self, views: int = 4, count: int = 32) -> dict[str, float]:
         """Accuracy of single pairs on the held-out scans, by the averaged weights; empty without any."""
@@ -295,15 +292,19 @@ class Trainer:
         if self._rank == 0:
             _cut_curve(self.folder / CURVE, self.step)
 
-    def _losses(self, batch: Batch, generator: np.random.Generator) -> torch.Tensor:
-        settings = self.settings
-        targets = make_targets(
-            batch,
-            settings.objective,
-            generator,
-            translation_frame=PRESETS[settings.preset].translation_frame,
-        )
-        precision = getattr(torch, settings.precision)
+    def _next_batch(self) -> tuple[Batch, Targets]:
+        if self._batches is None:
+            steps = _Steps(self.settings, self._scans, self._rank)
+            plan = _Plans(self.settings, self.step, self.images, self._processes)
+            loader: DataLoader[Any] = DataLoader(
+                steps, batch_size=None, sampler=plan, num_workers=self._workers
+            )
+            self._batches = iter(loader)
+        batch, targets = next(self._batches)
+        return batch, targets
+
+    def _losses(self, batch: Batch, targets: Targets) -> torch.Tensor:
+        precision = getattr(torch, self.settings.precision)
         mixed = precision is not torch.float32
         with torch.autocast(self._device.type, precision) if mixed else nullcontext():
             losses: torch.Tensor = self._objective(
@@ -345,6 +346,61 @@ class Trainer:
             if new:
                 writer.writeheader()
             writer.writerow(row)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What a step needs to be drawn, wherever that happens."""
+
+    step: int
+    views: int
+    max_angle: float
+
+
+class _Plans:
+    """The plans of all steps from one on. Every process has the same, so that none waits for another."""
+
+    def __init__(self, settings: TrainingSettings, step: int, images: int, processes: int) -> None:
+        self._settings, self._step, self._images, self._processes = settings, step, images, processes
+
+    def __iter__(self) -> Iterator[_Plan]:
+        settings, step, images = self._settings, self._step, self._images
+        while images < settings.images:
+            generator = np.random.default_rng([settings.seed, step])
+            views = int(generator.integers(settings.min_views, settings.max_views + 1))
+            yield _Plan(step, views, _max_angle(settings, images))
+            images += _scans_of(settings, views) * views * self._processes
+            step += 1
+
+
+class _Steps(Dataset[tuple[Batch, Targets]]):
+    """Batch and targets of a planned step: a function of the plan, the seed and the rank alone."""
+
+    def __init__(self, settings: TrainingSettings, scans: Scans, rank: int) -> None:
+        self._settings, self._scans, self._rank = settings, scans, rank
+
+    def __getitem__(self, plan: _Plan) -> tuple[Batch, Targets]:
+        settings = self._settings
+        generator = np.random.default_rng([settings.seed, plan.step, self._rank])
+        batch = make_batch(
+            self._scans,
+            _scans_of(settings, plan.views),
+            plan.views,
+            plan.max_angle,
+            generator,
+            settings.augmentation,
+        )
+        frame = PRESETS[settings.preset].translation_frame
+        return batch, make_targets(batch, settings.objective, generator, translation_frame=frame)
+
+
+def _scans_of(settings: TrainingSettings, views: int) -> int:
+    return max(1, settings.batch_images // views)
+
+
+def _max_angle(settings: TrainingSettings, images: int) -> float:
+    share = images / settings.images
+    return max((start, angle) for start, angle in settings.curriculum if start <= share)[1]
 
 
 BINS = ((0.0, 30.0), (30.0, 60.0), (60.0, 180.0))

@@ -9,7 +9,7 @@ from relpose_ros.geometry import so3
 from relpose_ros.network.presets import PRESETS
 
 
-def fake_shard(scans, views, size, seed):
+def make_shard(scans, views, size, seed):
     """Random pictures with consistent poses: cameras on a sphere that look at the origin, roughly upright."""
     generator = np.random.default_rng(seed)
     rotations = so3.random_rotations(scans * views, generator).reshape(scans, views, 3, 3)
@@ -24,6 +24,12 @@ def fake_shard(scans, views, size, seed):
         "places": places,
         "image_sizes": np.broadcast_to([640, 480], (scans, views, 2)).astype(np.int32),
     }
+
+
+@pytest.fixture(scope="session")
+def fake_shard():
+    """`make_shard`: scans, views, image size, seed."""
+    return make_shard
 
 
 @pytest.fixture
@@ -51,7 +57,7 @@ def tiny_preset(monkeypatch):
             map_side=4,
             descriptor_width=8,
             match_width=4,
-            layout_widths=(8, 8),
+            layout_widths=(16, 16),
             summary_width=8,
         ),
     )

@@ -1,0 +1,174 @@
+"""The protocol: the same orders for everybody, prefixes of each other; a perfect method scores perfectly."""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from relpose_ros.captures.folder import Frame, save_capture
+from relpose_ros.evaluation import protocol
+from relpose_ros.evaluation.baselines import ConstantTranslation, Identity, Poses
+from relpose_ros.evaluation.protocol import EvaluationError, PosedViews
+from relpose_ros.geometry import so3
+from relpose_ros.geometry.cameras import look_at, translation_of
+from relpose_ros.views import BoundingBox, View
+
+
+def posed(count=6, seed=0, name="thing"):
+    """Cameras on a sphere, each looking at its centre; a view's image holds its number."""
+    generator = np.random.default_rng(seed)
+    centres = generator.normal(size=(count, 3))
+    centres *= 3 / np.linalg.norm(centres, axis=1, keepdims=True)
+    rotations = look_at(centres, np.zeros(3))
+    pose = np.concatenate([rotations, translation_of(rotations, centres)[..., None]], -1)
+    return PosedViews(
+        name, pose, lambda k: View(np.full((8, 8, 3), k, np.uint8), BoundingBox(1, 1, 7, 7), 8, 8)
+    )
+
+
+@dataclass
+class Oracle:
+    """Knows the poses, in another world and unit; cameras after the ``fails_from``-th get no answer."""
+
+    sequence: PosedViews
+    name: str = "oracle"
+    fails_from: int = 99
+
+    def poses(self, views):
+        pose = self.sequence.camera_from_world[[int(view.image[0, 0, 0]) for view in views]]
+        turn = so3.exp([0.3, 0.2, -1.0])
+        rotations, translations = pose[:, :, :3] @ turn, 2.5 * pose[:, :, 3]
+        rotations[self.fails_from :] = np.nan
+        return Poses(rotations, translations)
+
+
+def test_orders_are_prefixes_seeded_and_independent_of_their_length():
+    long = protocol.view_orders("cup", 12, 8, seed=3)
+    assert len(long) == protocol.ORDERS
+    assert all(len(set(order)) == 8 for order in long)
+    assert [order[:3] for order in long] == protocol.view_orders("cup", 12, 3, seed=3)
+    assert long != protocol.view_orders("cup", 12, 8, seed=4)
+    assert long != protocol.view_orders("mug", 12, 8, seed=3)
+    assert {len(order) for order in protocol.view_orders("cup", 5, 8)} == {5}
+
+
+def test_a_perfect_method_is_perfect_at_every_number_of_views():
+    sequence = posed()
+    rows = protocol.measure(sequence, [Oracle(sequence)], [2, 4, 6, 8], orders=3)
+    assert [row["views"] for row in rows] == [2, 4, 6]  # there are six photos
+    for row in rows:
+        assert row["scans"] == 3
+        assert row["rotation@5"] == row["center@0.1"] == row["translation@0.1"] == 1
+        assert row["rotation@median"] < 1e-4
+        assert row["rotation@auc60"] == pytest.approx(1)
+
+
+def test_cameras_without_an_answer_count_as_wrong():
+    sequence = posed()
+    (row,) = protocol.measure(sequence, [Oracle(sequence, fails_from=3)], [4], orders=2)
+    assert row["rotation@30"] == pytest.approx(6 / 12)
+    assert row["center@0.3"] == pytest.approx(3 / 4)
+
+
+def test_constant_translation_keeps_the_rotations_and_suits_cameras_that_look_at_the_object():
+    sequence = posed()
+    method = ConstantTranslation(Oracle(sequence))
+    (row,) = protocol.measure(sequence, [method], [5], orders=2)
+    assert row["method"] == "constant-translation"
+    assert row["rotation@5"] == 1
+    assert row["center@0.1"] == 1  # all of these cameras stand at one distance, facing the origin
+    partial = ConstantTranslation(Oracle(sequence, fails_from=2)).poses([sequence.view(k) for k in range(3)])
+    assert np.isnan(partial.translations[2]).all()
+    assert np.isfinite(partial.translations[:2]).all()
+
+
+def test_the_identity_is_right_only_for_near_neighbours():
+    sequence = posed(count=8)
+    (row,) = protocol.measure(sequence, [Identity()], [8], orders=1)
+    angles = [
+        np.degrees(so3.angle_between(a, b))
+        for x, a in enumerate(sequence.camera_from_world[:, :, :3])
+        for y, b in enumerate(sequence.camera_from_world[:, :, :3])
+        if x != y
+    ]
+    assert row["rotation@30"] == pytest.approx((np.array(angles) <= 30).mean())
+
+
+def test_evaluate_writes_rows_and_their_mean(tmp_path):
+    output = tmp_path / "rows.json"
+    sequences = [posed(name="one"), posed(name="two", seed=1)]
+    rows = protocol.evaluate(
+        sequences, [2, 3], methods=["identity"], output=output, orders=2, progress=False
+    )
+    assert [row["capture"] for row in rows] == ["one", "one", "two", "two", "mean", "mean"]
+    for key in ("rotation@15", "rotation@auc60", "center@0.2", "seconds"):
+        assert rows[5][key] == pytest.approx((rows[1][key] + rows[3][key]) / 2)
+    assert rows[5]["scans"] == 4
+    assert json.loads(output.read_text())["rows"] == rows
+    text = protocol.table(rows).splitlines()
+    assert len(text) == 7
+    assert text[0].split()[:4] == ["capture", "method", "N", "scans"]
+    assert text[-1].split()[:4] == ["mean", "identity", "3", "4"]
+
+
+def test_wrong_questions_are_answered_with_a_sentence():
+    with pytest.raises(EvaluationError, match="no capture"):
+        protocol.evaluate([], progress=False)
+    with pytest.raises(EvaluationError, match="between 2 and 8"):
+        protocol.evaluate([posed()], [1, 2], methods=["identity"], progress=False)
+    with pytest.raises(EvaluationError, match="magic"):
+        protocol.evaluate([posed()], [2], methods=["magic"], progress=False)
+
+
+def test_only_photos_with_a_pose_are_measured_on(tmp_path):
+    sequence = posed(3)
+    frames = [
+        Frame(sequence.view(k), None if k == 1 else sequence.camera_from_world[k]) for k in range(3)
+    ]
+    capture = save_capture(tmp_path / "thing", frames)
+    views = protocol.posed_views(capture)
+    assert views.name == "thing"
+    np.testing.assert_allclose(views.camera_from_world, sequence.camera_from_world[[0, 2]], atol=1e-8)
+    assert int(views.view(1).image.mean()) == 2
+    with pytest.raises(EvaluationError, match="1 photos"):
+        protocol.posed_views(save_capture(tmp_path / "lone", frames[:2]))
+
+
+def test_colmap_recovers_a_textured_scene():
+    pytest.importorskip("pycolmap")
+    cv2 = pytest.importorskip("cv2")
+    from relpose_ros.evaluation.baselines import Colmap
+    from relpose_ros.views import Intrinsics
+
+    # Two textured planes at an angle, drawn by their homographies.
+    generator = np.random.default_rng(0)
+    textures = [
+        cv2.resize(generator.integers(0, 256, (64, 64, 3), dtype=np.uint8), (512, 512), interpolation=cv2.INTER_CUBIC)
+        for _ in range(2)
+    ]
+    planes = [  # corner and two edges of a square of side 2
+        (np.array([-2.0, -1, 0]), np.array([2.0, 0, 0.6]), np.array([0, 2.0, 0])),
+        (np.array([0.0, -1, 0.6]), np.array([2.0, 0, -0.8]), np.array([0, 2.0, 0])),
+    ]
+    camera = np.array([[400.0, 0, 240], [0, 400, 180], [0, 0, 1]])
+    views, rotations = [], []
+    for angle in (-0.25, 0.0, 0.25):
+        centre = 5 * np.array([np.sin(angle), 0.1 * angle, -np.cos(angle)])
+        rotation = look_at(centre, np.zeros(3), (0, -1, 0))
+        image = np.zeros((360, 480, 3), np.uint8)
+        for texture, (corner, right, down) in zip(textures, planes, strict=True):
+            to_world = np.column_stack([right / 512, down / 512, corner])
+            homography = camera @ (rotation @ to_world + np.outer(-rotation @ centre, [0, 0, 1]))
+            drawn = cv2.warpPerspective(texture, homography, (480, 360))
+            inside = cv2.warpPerspective(np.ones((512, 512), np.uint8), homography, (480, 360))
+            image[inside > 0] = drawn[inside > 0]
+        views.append(
+            View(image, BoundingBox(0, 0, 480, 360), 480, 360, intrinsics=Intrinsics(400, 400, 240, 180))
+        )
+        rotations.append(rotation)
+    estimate = Colmap().poses(views)
+    for i, j in ((0, 1), (0, 2)):
+        true = rotations[j] @ rotations[i].T
+        found = estimate.rotations[j] @ estimate.rotations[i].T
+        assert np.degrees(so3.angle_between(found, true)) < 1

@@ -1,0 +1,184 @@
+"""The loop: it learns, it resumes to the same weights, it stops in time, its checkpoints survive being cut."""
+
+import csv
+import os
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from relpose_ros.network.checkpoint import read_metadata
+from relpose_ros.training import trainer
+from relpose_ros.training.batches import Augmentation, Scans
+from relpose_ros.training.objective import ObjectiveSettings
+from relpose_ros.training.trainer import Trainer, TrainingError, TrainingSettings
+
+pytestmark = pytest.mark.usefixtures("tiny_preset")
+
+SETTINGS = TrainingSettings(
+    preset="tiny",
+    images=160,
+    batch_images=8,
+    max_views=4,
+    warmup_images=16,
+    precision="float32",
+    objective=ObjectiveSettings(uniform_rotations=16, near_rotations=8, pairs=3, match_weight=0.5),
+)
+
+
+@pytest.fixture
+def scans(fake_shard):
+    return Scans([fake_shard(6, 5, 32, 0)])
+
+
+def weights(network):
+    return torch.cat([parameter.detach().flatten() for parameter in network.parameters()])
+
+
+def test_a_resumed_run_ends_with_the_same_weights_and_curve(tmp_path, scans):
+    whole = Trainer(SETTINGS, tmp_path / "whole", scans, scans)
+    whole.run(log_every=2, check_every=6, progress=False)
+    assert whole.finished
+    first = Trainer(SETTINGS, tmp_path / "halves", scans, scans)
+    for _ in range(9):
+        first.train_step()
+    first.save()
+    first.train_step()  # what came after the checkpoint is lost
+    second = Trainer(SETTINGS, tmp_path / "halves", scans, scans)
+    assert second.step == 9
+    second.run(log_every=2, check_every=6, progress=False)
+    assert weights(second.network).equal(weights(whole.network))
+    assert weights(second.average).equal(weights(whole.average))
+
+    def rows(folder):
+        with (tmp_path / folder / trainer.CURVE).open() as stream:
+            return {row["step"]: row for row in csv.DictReader(stream)}
+
+    for step, row in rows("halves").items():
+        if int(step) >= 12:  # the rows whose means began after the checkpoint
+            for column in ("images", "loss", "learning_rate", "pair@30"):
+                assert row[column] == rows("whole")[step][column]
+    assert int(step) == whole.step - whole.step % 2
+
+
+def test_time_that_is_up_leaves_a_checkpoint_and_weights(tmp_path, scans):
+    run = Trainer(SETTINGS, tmp_path, scans)
+    run.run(budget_s=0.0, progress=False)
+    assert run.step == 0
+    assert not run.finished
+    assert Trainer(SETTINGS, tmp_path, scans).step == 0
+    metadata = read_metadata(tmp_path / trainer.WEIGHTS)
+    assert metadata["images_seen"] == "0"
+
+
+def test_it_learns_a_handful_of_scans(tmp_path, fake_shard):
+    settings = replace(
+        SETTINGS,
+        images=1600,
+        learning_rate=5e-3,
+        objective=replace(SETTINGS.objective, match_weight=0.0),
+        augmentation=Augmentation(mirror=0, quarter_turns=0, masked=0, grey=0, gain=0, noisy=0),
+        curriculum=((0.0, 180.0),),
+    )
+    run = Trainer(settings, tmp_path, Scans([fake_shard(1, 4, 32, 0)]))
+    losses = [run.train_step().tolist() for _ in range(150)]
+    assert np.mean([loss[1] for loss in losses[:5]]) > -0.3  # knows nothing
+    assert np.mean([loss[1] for loss in losses[-20:]]) < -1.0
+
+
+def test_the_learning_rate_rises_stays_and_falls(tmp_path, scans):
+    run = Trainer(SETTINGS, tmp_path, scans)
+    rates = []
+    for images in range(0, 160, 8):
+        run.images = images
+        rates.append(run.learning_rate())
+    assert rates[0] == pytest.approx(SETTINGS.learning_rate / 2)
+    assert max(rates) == SETTINGS.learning_rate
+    falling = rates[int(len(rates) * 0.65) :]
+    assert falling == sorted(falling, reverse=True)
+    assert falling[-1] < 0.2 * SETTINGS.learning_rate
+    run.images = 0
+    assert run.max_angle() == 45
+    run.images = 159
+    assert run.max_angle() == 180
+
+
+def test_a_checkpoint_in_pieces_comes_back_whole_and_damage_is_noticed(tmp_path):
+    state = {"numbers": torch.arange(1000), "step": 3}
+    trainer.save_pieces(state, tmp_path, piece_bytes=1000)
+    pieces = sorted(tmp_path.glob("checkpoint-*"))
+    assert len(pieces) > 5
+    assert max(piece.stat().st_size for piece in pieces) <= 1000
+    assert trainer.load_pieces(tmp_path)["numbers"].equal(state["numbers"])
+    trainer.save_pieces({"step": 4}, tmp_path, piece_bytes=1000)
+    assert trainer.load_pieces(tmp_path) == {"step": 4}
+    assert not any(piece.exists() for piece in pieces)
+    (piece, *_) = tmp_path.glob("checkpoint-*")
+    damaged = bytearray(piece.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    piece.write_bytes(damaged)
+    with pytest.raises(TrainingError, match="damaged"):
+        trainer.load_pieces(tmp_path)
+    piece.unlink()
+    with pytest.raises(TrainingError, match="cannot be read"):
+        trainer.load_pieces(tmp_path)
+
+
+def test_a_checkpoint_of_another_network_is_refused(tmp_path, scans, tiny_preset, monkeypatch):
+    Trainer(SETTINGS, tmp_path, scans).save()
+    monkeypatch.setitem(trainer.PRESETS, "tiny", replace(tiny_preset, feedforward_width=8))
+    with pytest.raises(TrainingError, match="another network"):
+        Trainer(SETTINGS, tmp_path, scans)
+
+
+def test_unknown_presets_are_refused():
+    with pytest.raises(TrainingError, match="paper, compact"):
+        trainer.settings_for("large")
+
+
+def test_pair_accuracy_of_a_network_that_knows_nothing_is_near_chance(tiny_preset, scans):
+    network = trainer.random_network(tiny_preset, 0)
+    figures = trainer.pair_accuracy(network, scans, views=3, count=10)
+    assert set(figures) == set(trainer.ACCURACIES)
+    assert figures["pair@30"] < 0.3
+    assert 60 < figures["pair_median"] < 180
+
+
+PROCESS = """
+import pickle, sys
+from pathlib import Path
+import torch
+from relpose_ros.network.presets import PRESETS
+from relpose_ros.training.batches import Scans
+from relpose_ros.training.trainer import Trainer
+
+torch.set_num_threads(1)
+folder = Path(sys.argv[1])
+PRESETS["tiny"], settings, shard = pickle.loads((folder / "run.pickle").read_bytes())
+run = Trainer(settings, folder / "run", Scans([shard]))
+run.run(progress=False, check_every=2)
+total = sum(parameter.double().sum().item() for parameter in run.network.parameters())
+print("weights", total, run.images)
+torch.distributed.destroy_process_group()
+"""
+
+
+def test_two_processes_hold_the_same_weights(tmp_path, tiny_preset, fake_shard):
+    settings = replace(SETTINGS, images=48, batch_images=4)
+    (tmp_path / "run.pickle").write_bytes(pickle.dumps((tiny_preset, settings, fake_shard(6, 5, 32, 0))))
+    script = tmp_path / "script.py"
+    script.write_text(PROCESS)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    command += [str(script), str(tmp_path)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    ends = [line for line in done.stdout.splitlines() if line.startswith("weights")]
+    assert len(ends) == 2
+    assert ends[0] == ends[1]
+    assert int(ends[0].split()[-1]) >= 48
+    assert (tmp_path / "run" / "checkpoint.json").exists()
