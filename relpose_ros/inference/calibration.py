@@ -1,9 +1,46 @@
-"""How far a network's energies are log-probabilities: fitted on held-out scans, kept with the weights."""
+"""How far a network's energies are log-probabilities: fitted on held-out scans, kept with the weights.
+
+One temperature for all energies (Guo et al. 2017, On calibration of modern neural networks), then factors on
+the covariances where they still miss: `observe` held-out scans, `fit_calibration`, `measure_calibration`.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from relpose_ros.geometry import cameras, so3
+from relpose_ros.inference.global_rotations import solve
+from relpose_ros.inference.pair_distribution import search
+from relpose_ros.inference.pair_energies import PairEnergies
+from relpose_ros.inference.uncertainty import WITHIN, camera_covariances, describe_pairs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from typing import Any
+
+    import numpy.typing as npt
+
+    from relpose_ros.estimates import PairRotation
+    from relpose_ros.inference.global_rotations import JointSolutions
+    from relpose_ros.inference.pair_distribution import PairDistributions
+    from relpose_ros.inference.pair_energies import EnergyModel, GridEmbeddings
+
+    FloatArray = npt.NDArray[np.float64]
+
+LEVELS = (0.5, 0.9, 0.95)
+"""Nominal coverages that are reported."""
+CHI_SQUARE_3 = (2.366, 6.251, 7.815)
+"""Quantiles of the chi-square distribution with three degrees of freedom at those levels."""
+BINS = 10
+"""Of predicted probability, for the expected calibration error."""
+TEMPERATURES = (1 / 32, 32.0)
+"""Range in which the temperature is looked for. The log-likelihood is concave in 1/T: it has one maximum."""
 
 
 @dataclass(frozen=True)
@@ -33,3 +70,196 @@ class Calibration:
         if "translation_sigma" in known:
             known["translation_sigma"] = tuple(float(sigma) for sigma in known["translation_sigma"])
         return cls(**known)
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One held-out scan: what the network and the solver made of it, and the truth."""
+
+    energies: PairEnergies
+    distributions: PairDistributions
+    solutions: JointSolutions
+    translations: FloatArray
+    """(N, 3) predicted, camera_from_object, the first at distance 1."""
+    true_rotations: FloatArray
+    """(N, 3, 3) camera_from_object, the first the identity."""
+    true_translations: FloatArray
+    """(N, 3), the first at distance 1."""
+    energy_at_truth: torch.Tensor
+    """(P,) float64."""
+
+
+@dataclass(frozen=True)
+class CalibrationReport:
+    """How well stated probabilities and covariances hold on some scans."""
+
+    pairs: int
+    log_likelihood: float
+    """Mean over pairs of the log density of the truth, nats relative to uniform."""
+    expected_calibration_error: float
+    """Of "within 15 degrees of the strongest mode", 0 to 1."""
+    pair_coverage: tuple[float, ...]
+    """Share of pairs whose truth lies in the 50, 90 and 95% ellipsoid of the covariance."""
+    camera_rotation_coverage: tuple[float, ...]
+    """The same of cameras' rotations, the gauge camera left out."""
+    camera_position_coverage: tuple[float, ...]
+    """The same of cameras' positions."""
+
+
+def observe(
+    model: EnergyModel,
+    grid: GridEmbeddings,
+    features: Any,
+    translations: FloatArray,
+    true_rotations: FloatArray,
+    true_translations: FloatArray,
+) -> Observation:
+    """Solves a held-out scan and keeps what a calibration needs of it.
+
+    Args:
+        model: the network.
+        grid: its embeddings of the rotation grid, shared by all scans.
+        features: of the scan's N views.
+        translations: (N, 3) predicted, camera_from_object, optical.
+        true_rotations: (N, 3, 3) camera_from_object in any object frame.
+        true_translations: (N, 3) in the same frame, any unit.
+    """
+    about_look_at, _, _ = cameras.look_at_translations(true_rotations, true_translations)
+    rotations = true_rotations @ true_rotations[0].T
+    with torch.no_grad():
+        energies = PairEnergies.of(model, features, len(rotations))
+        distributions = search(energies, grid)
+        truth = torch.from_numpy(rotations)
+        relative = truth[energies.j] @ truth[energies.i].mT
+        at_truth = energies.at(torch.arange(energies.count), relative[:, None])[:, 0].double()
+        solutions = solve(energies, distributions)
+    predicted = translations / max(float(np.linalg.norm(translations[0])), 1e-6)
+    return Observation(energies, distributions, solutions, predicted, rotations, about_look_at, at_truth)
+
+
+def log_likelihood(observations: Sequence[Observation], temperature: float) -> float:
+    """Mean over all pairs of the log density of the truth relative to uniform, nats."""
+    parts = [
+        o.energy_at_truth / temperature - o.distributions.log_normaliser(temperature) for o in observations
+    ]
+    return float(torch.cat(parts).mean())
+
+
+def fit_calibration(observations: Sequence[Observation]) -> Calibration:
+    """The temperature with the highest likelihood of the truth, then factors that make 90% ellipsoids hold.
+
+    A factor is kept only where it brings the coverages at 50, 90 and 95% nearer to their names.
+    """
+    temperature = _maximise(lambda t: log_likelihood(observations, t), *TEMPERATURES)
+    calibration = Calibration(temperature, translation_sigma=_translation_sigma(observations))
+    pair_squares, rotation_squares, _ = _mahalanobis_squares(observations, calibration)
+    return Calibration(
+        temperature, _spread(pair_squares), _spread(rotation_squares), calibration.translation_sigma
+    )
+
+
+def measure_calibration(observations: Sequence[Observation], calibration: Calibration) -> CalibrationReport:
+    """What a calibration is worth, best asked of scans that it was not fitted on."""
+    stated, right = [], []
+    for observation in observations:
+        for pair in _pairs(observation, calibration):
+            stated.append(pair.probability_within_15_deg)
+            right.append(_angle_to_truth(observation, pair.i, pair.j, pair.camera_j_from_camera_i) < WITHIN)
+    pair_squares, rotation_squares, position_squares = _mahalanobis_squares(observations, calibration)
+    return CalibrationReport(
+        pairs=len(stated),
+        log_likelihood=log_likelihood(observations, calibration.temperature),
+        expected_calibration_error=expected_calibration_error(np.array(stated), np.array(right)),
+        pair_coverage=_coverage(pair_squares),
+        camera_rotation_coverage=_coverage(rotation_squares),
+        camera_position_coverage=_coverage(position_squares),
+    )
+
+
+def expected_calibration_error(stated: FloatArray, right: npt.NDArray[np.bool_]) -> float:
+    """Mean distance between stated probabilities and frequencies, over bins of equal width. (K,), (K,)."""
+    bins = np.minimum((stated * BINS).astype(int), BINS - 1)
+    gaps = [
+        (bins == which).sum() * abs(stated[bins == which].mean() - right[bins == which].mean())
+        for which in np.unique(bins)
+    ]
+    return float(sum(gaps) / len(stated))
+
+
+def _pairs(observation: Observation, calibration: Calibration) -> tuple[PairRotation, ...]:
+    best = observation.solutions.rotations[0]
+    return describe_pairs(observation.distributions, observation.energies, best, calibration)
+
+
+def _true_relative(observation: Observation, i: int, j: int) -> FloatArray:
+    return np.asarray(observation.true_rotations[j] @ observation.true_rotations[i].T)
+
+
+def _angle_to_truth(observation: Observation, i: int, j: int, rotation: FloatArray) -> float:
+    return float(so3.angle_between(_true_relative(observation, i, j), rotation))
+
+
+def _mahalanobis_squares(
+    observations: Sequence[Observation], calibration: Calibration
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Squared errors in units of the stated covariances: of pairs, camera rotations and camera positions."""
+    of_pairs, of_rotations, of_positions = [], [], []
+    for observation in observations:
+        for pair in _pairs(observation, calibration):
+            truth = _true_relative(observation, pair.i, pair.j)
+            of_pairs.append(_square(so3.log(truth @ pair.camera_j_from_camera_i.T), pair.covariance))
+        with torch.no_grad():
+            covariances = camera_covariances(
+                observation.energies, observation.solutions, observation.translations, calibration
+            )
+        rotations = observation.solutions.rotations[0].numpy()
+        centres = cameras.camera_centre(rotations, observation.translations)
+        true_centres = cameras.camera_centre(observation.true_rotations, observation.true_translations)
+        for camera in range(1, len(rotations)):
+            turn = so3.log(observation.true_rotations[camera].T @ rotations[camera])  # axes of the object
+            of_rotations.append(_square(turn, covariances[camera, 3:, 3:]))
+            shift = true_centres[camera] - centres[camera]
+            of_positions.append(_square(shift, covariances[camera, :3, :3]))
+    return np.array(of_pairs), np.array(of_rotations), np.array(of_positions)
+
+
+def _square(error: FloatArray, covariance: FloatArray) -> float:
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+def _coverage(squares: FloatArray) -> tuple[float, ...]:
+    return tuple(float((squares <= quantile).mean()) for quantile in CHI_SQUARE_3)
+
+
+def _spread(squares: FloatArray) -> float:
+    factor = float(np.quantile(squares, LEVELS[1])) / CHI_SQUARE_3[1]
+
+    def miss(coverage: tuple[float, ...]) -> float:
+        return sum(abs(got - wanted) for got, wanted in zip(coverage, LEVELS, strict=True))
+
+    return factor if miss(_coverage(squares / factor)) < miss(_coverage(squares)) else 1.0
+
+
+def _translation_sigma(observations: Sequence[Observation]) -> tuple[float, float, float]:
+    """From the 90% quantile of each axis: a few gross errors should not widen every stated position."""
+    errors = np.concatenate([np.abs(o.translations - o.true_translations) for o in observations])
+    x, y, z = np.maximum(np.quantile(errors, 0.9, axis=0) / 1.645, 1e-3)
+    return float(x), float(y), float(z)
+
+
+def _maximise(height: Callable[[float], float], low: float, high: float) -> float:
+    """Golden-section search of a function with one maximum, on a logarithmic scale, to one per cent."""
+    ratio = (math.sqrt(5) - 1) / 2
+    a, b = math.log(low), math.log(high)
+    left, right = b - ratio * (b - a), a + ratio * (b - a)
+    at_left, at_right = height(math.exp(left)), height(math.exp(right))
+    while b - a > 0.01:
+        if at_left > at_right:
+            b, right, at_right = right, left, at_left
+            left = b - ratio * (b - a)
+            at_left = height(math.exp(left))
+        else:
+            a, left, at_left = left, right, at_right
+            right = a + ratio * (b - a)
+            at_right = height(math.exp(right))
+    return math.exp((a + b) / 2)

@@ -36,13 +36,16 @@ class AscentSettings:
     climb_steps: int = 16
     jumps: int = 2
     """Sweeps in which a camera may leave for any mode of its pairs."""
-    hops: int = 5
+    content: float = 1.0
+    """A camera stays when its pairs are on average this near to their highest modes, in nats: even the best
+    place could gain no more. This is what makes scans cheap whose pairs agree."""
+    hops: int = 4
     """Places considered for a camera in such a sweep: so many modes, and so many cells of the coarse grid."""
-    hop_steps: int = 8
+    hop_steps: int = 6
     """Gradient steps at each before they are compared."""
-    radii: tuple[float, ...] = tuple(math.radians(a) for a in (8, 4, 2, 1))
+    radii: tuple[float, ...] = tuple(math.radians(a) for a in (8, 4, 2))
     """Neighbourhood of each sweep over the cameras, rad."""
-    last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (4, 2, 1, 0.5, 0.25))
+    last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (2, 1, 0.5, 0.25))
     """The same for the best climber alone, at the end."""
     distinct: float = math.radians(10)
     """Solutions are different where some camera differs by more, rad."""
@@ -221,14 +224,18 @@ def _jump(
     camera agree on may be the top of none of them.
     """
     rotations = rotations.clone()
-    rows = torch.arange(len(rotations))
     for camera in range(energies.views):
         others = [other for other in range(energies.views) if other != camera]
-        here = rotations[:, camera, None]
-        modes = torch.cat([here, _mode_candidates(energies, distributions, rotations, camera, others)], 1)
-        gains = _conditional(energies, rotations, camera, others, modes)
-        cells = distributions.coarse_rotations.expand(len(rotations), -1, -1, -1)
-        guesses = _coarse_conditional(energies, distributions, rotations, camera, others)
+        ceiling = distributions.mode_energies[energies.pair_of[camera, others], 0].sum()
+        now = _conditional(energies, rotations, camera, others, rotations[:, camera, None])[:, 0]
+        restless = (ceiling - now > settings.content * len(others)).nonzero()[:, 0]
+        if len(restless) == 0:
+            continue
+        moving = rotations[restless]
+        modes = _mode_candidates(energies, distributions, moving, camera, others)
+        gains = _conditional(energies, moving, camera, others, modes)
+        cells = distributions.coarse_rotations.expand(len(moving), -1, -1, -1)
+        guesses = _coarse_conditional(energies, distributions, moving, camera, others)
         starts = torch.cat(
             [
                 peaks(modes, gains, settings.hops, settings.distinct)[0],
@@ -236,15 +243,28 @@ def _jump(
             ],
             1,
         )
-
-        def height(places: torch.Tensor) -> torch.Tensor:
-            return _conditional(energies, rotations, camera, others, places.view_as(starts)).flatten()
-
-        hills, heights = ascend(height, starts.flatten(0, 1), settings.climb_stride, settings.hop_steps)
-        hills = torch.cat([here, hills.view_as(starts)], 1)
-        heights = torch.cat([gains[:, :1], heights.view(starts.shape[:2])], 1)
-        rotations[:, camera] = hills[rows, heights.argmax(1)]
+        hills, heights = _climb_camera(energies, moving, camera, others, starts, settings)
+        hills = torch.cat([moving[:, camera, None], hills], 1)
+        heights = torch.cat([now[restless, None], heights], 1)
+        rotations[restless, camera] = hills[torch.arange(len(moving)), heights.argmax(1)]
     return rotations
+
+
+def _climb_camera(
+    energies: PairEnergies,
+    rotations: torch.Tensor,
+    camera: int,
+    others: list[int],
+    starts: torch.Tensor,
+    settings: AscentSettings,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Climbs one camera from each of its starts, the others held. (S, C, 3, 3) -> the same, and (S, C)."""
+
+    def height(places: torch.Tensor) -> torch.Tensor:
+        return _conditional(energies, rotations, camera, others, places.view_as(starts)).flatten()
+
+    hills, heights = ascend(height, starts.flatten(0, 1), settings.climb_stride, settings.hop_steps)
+    return hills.view_as(starts), heights.view(starts.shape[:2])
 
 
 def _coarse_conditional(
@@ -265,7 +285,8 @@ def _coarse_conditional(
         relative = cells @ rotations[:, other, None].mT  # (S, C, 3, 3)
         if camera < other:
             relative = relative.mT
-        nearest = (relative.flatten(2).float() @ flat.T).argmax(-1)
+        likeness = relative.flatten(2).float() @ flat.T  # traces; numpy finds their maxima ten times sooner
+        nearest = torch.from_numpy(likeness.numpy().argmax(-1))
         totals += distributions.coarse[energies.pair_of[camera, other]][nearest]
     return totals
 

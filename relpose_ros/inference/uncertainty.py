@@ -53,7 +53,7 @@ def describe_pairs(
         solution: (N, 3, 3) float64 camera_from_object.
         calibration: of the network.
     """
-    solved = solution[energies.j] @ solution[energies.i].transpose(-1, -2)
+    solved = solution[energies.j] @ solution[energies.i].mT
     masses = distributions.masses(calibration.temperature)
     entropies = -(masses * (masses.clamp_min(1e-300).log() - distributions.log_volumes)).sum(1)
     pairs = []
@@ -155,9 +155,13 @@ def camera_covariances(
     temperature = calibration.temperature * energies.views / 2
     best = solutions.rotations[0]
     information = _joint_information(energies, best, temperature)
-    spread = np.linalg.inv(information) * calibration.camera_spread
-    chances = torch.softmax(solutions.scores / temperature, 0).numpy()
-    offsets = so3.log((solutions.rotations @ best.transpose(-1, -2)).numpy())  # (S, N, 3), camera axes
+    spread = np.linalg.inv(information)
+    offsets = so3.log((solutions.rotations @ best.mT).numpy())  # (S, N, 3), camera axes
+    # What lies nearer is the same hill, and in its curvature already.
+    apart = np.linalg.norm(offsets, axis=2).max(1) > BASIN
+    apart[0] = True
+    offsets = offsets[apart]
+    chances = torch.softmax(solutions.scores[torch.from_numpy(apart)] / temperature, 0).numpy()
     rotations = best.numpy()
     sigma = np.array(calibration.translation_sigma)
     covariances = np.empty((energies.views, 6, 6))
@@ -171,7 +175,7 @@ def camera_covariances(
         else:
             block = spread[3 * camera - 3 : 3 * camera, 3 * camera - 3 : 3 * camera]
             others = np.einsum("s,sa,sb->ab", chances, offsets[:, camera], offsets[:, camera])
-            rotation_part = block + others + FLOOR**2 * np.eye(3)
+            rotation_part = (block + others) * calibration.camera_spread + FLOOR**2 * np.eye(3)
             translation_part = np.diag(sigma**2)
         object_from_camera = rotations[camera].T
         # A turn e of the camera (axes of the camera, left perturbation of camera_from_object) is the turn
@@ -188,7 +192,7 @@ def _joint_information(energies: PairEnergies, rotations: torch.Tensor, temperat
     With R_ij = R_j R_i^T, turns e_i and e_j of the cameras turn R_ij by e_j - R_ij e_i.
     (N, 3, 3) -> (3 N - 3, 3 N - 3).
     """
-    relative = rotations[energies.j] @ rotations[energies.i].transpose(-1, -2)
+    relative = rotations[energies.j] @ rotations[energies.i].mT
     curvatures = _curvatures(energies, relative) / temperature
     information = np.eye(3 * energies.views) / UNIFORM_VARIANCE
     for pair, (i, j) in enumerate(zip(energies.i.tolist(), energies.j.tolist(), strict=True)):

@@ -28,7 +28,7 @@ def worst_angle(a, b):
 @pytest.mark.parametrize("views", [2, 3, 5, 8])
 def test_finds_the_rotations_that_all_pairs_agree_on(fisher_scene, cameras_around, views):
     cameras = cameras_around(views, seed=views)
-    energies, solutions = solved(fisher_scene(cameras))
+    _, solutions = solved(fisher_scene(cameras))
     assert worst_angle(solutions.rotations[0].numpy(), cameras) < 0.1
     assert float(solutions.scores[0]) == pytest.approx(0, abs=1e-2)
 
@@ -36,7 +36,7 @@ def test_finds_the_rotations_that_all_pairs_agree_on(fisher_scene, cameras_aroun
 @given(
     seed=st.integers(0, 10_000), views=st.integers(2, 6), concentration=st.sampled_from([3.0, 20.0, 100.0])
 )
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10)
 def test_never_scores_below_the_truth(fisher_scene_type, seed, views, concentration):
     scene_type, cameras_around = fisher_scene_type
     cameras = cameras_around(views, seed)
@@ -52,7 +52,7 @@ def test_never_scores_below_the_truth(fisher_scene_type, seed, views, concentrat
 
 
 def test_one_decided_pair_decides_for_a_symmetric_object(fisher_scene, cameras_around):
-    """Two equal modes half a turn apart in all pairs with view 2 but one: the joint optimum takes the right ones."""
+    """Two modes half a turn apart in two of view 2's pairs, the wrong one higher: the third pair decides."""
     cameras = cameras_around(4, seed=3)
     scene = fisher_scene(cameras)
     for i, j in [(0, 2), (2, 3)]:

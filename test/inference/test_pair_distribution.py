@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from relpose_ros.geometry import so3
+from relpose_ros.inference.pair_distribution import SearchSettings, ascend, peaks, search
+from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
+
+
+def searched(scene, **settings):
+    with torch.no_grad():
+        energies = PairEnergies.of(scene, scene, len(scene))
+        return energies, search(energies, GridEmbeddings(scene), SearchSettings(**settings))
+
+
+def test_cells_partition_the_rotations(fisher_scene, cameras_around):
+    _, found = searched(fisher_scene(cameras_around(3, 0)))
+    assert float(found.log_volumes.exp().sum()) == pytest.approx(1)
+    assert found.masses().sum(1).tolist() == pytest.approx([1, 1, 1])
+    # A partition holds every cell once: no centre comes twice.
+    for rotations in found.rotations.numpy():
+        assert len(np.unique(rotations.round(9).reshape(-1, 9), axis=0)) == len(rotations)
+
+
+def test_a_flat_energy_is_uniform(fisher_scene, cameras_around):
+    _, found = searched(fisher_scene(cameras_around(2, 0), concentration=0.0))
+    assert float(found.log_normaliser()[0]) == pytest.approx(0, abs=1e-9)
+    torch.testing.assert_close(found.masses()[0].log(), found.log_volumes)
+
+
+@pytest.mark.parametrize("concentration", [0.5, 3.0, 12.0])
+def test_normaliser_is_that_of_the_matrix_fisher_density(fisher_scene, cameras_around, concentration):
+    """The mean of exp(k (tr R - 3)) is an integral over the angle, whose density is (1 - cos w) / pi."""
+    _, found = searched(fisher_scene(cameras_around(2, 1), concentration))
+    angles = np.linspace(0, math.pi, 20_001)
+    density = np.exp(2 * concentration * (np.cos(angles) - 1)) * (1 - np.cos(angles)) / math.pi
+    exact = math.log(np.trapezoid(density, angles))
+    assert float(found.log_normaliser()[0]) == pytest.approx(exact, abs=0.03)
+
+
+@given(
+    seed=st.integers(0, 10_000), angle=st.floats(60, 180), concentration=st.sampled_from([12.0, 40.0, 150.0])
+)
+@settings(max_examples=12)
+def test_both_modes_of_a_symmetric_pair_are_found(fisher_scene_type, seed, angle, concentration):
+    scene_type, cameras_around = fisher_scene_type
+    scene = scene_type(cameras_around(2, seed))
+    axis = np.random.default_rng(seed).standard_normal(3)
+    true = scene.relative(0, 1)
+    other = so3.exp(math.radians(angle) * axis / np.linalg.norm(axis)) @ true
+    scene.mixtures[0, 1] = [(true, 0.0, concentration), (other, -0.7, concentration)]
+    _, found = searched(scene)
+    first, second = found.modes[0, :2].numpy()
+    assert math.degrees(so3.angle_between(first, true)) < 1
+    assert math.degrees(so3.angle_between(second, other)) < 1
+    assert found.mode_energies[0, 0] >= found.mode_energies[0, 1] > -math.inf
+
+
+def test_peaks_keep_their_distance(fisher_scene):
+    rotations = torch.from_numpy(so3.random_rotations(200, np.random.default_rng(0)))[None]
+    values = torch.rand(1, 200, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    tops, heights = peaks(rotations, values, 5, math.radians(40))
+    assert float(heights[0, 0]) == float(values.max())
+    assert (heights[0].diff() <= 0).all()
+    angles = so3.angle_between(tops[0][:, None].numpy(), tops[0][None].numpy())
+    assert angles[~np.eye(5, dtype=bool)].min() > math.radians(40)
+
+
+def test_peaks_say_when_there_are_no_more():
+    rotations = torch.eye(3, dtype=torch.float64).expand(1, 4, 3, 3)
+    _, heights = peaks(rotations, torch.arange(4.0, dtype=torch.float64)[None], 3, math.radians(10))
+    assert heights[0].tolist() == [3.0, -math.inf, -math.inf]
+
+
+def test_ascent_climbs_and_never_falls():
+    target = torch.from_numpy(so3.exp([0.3, -0.2, 0.4]))
+    starts = torch.from_numpy(so3.random_rotations(20, np.random.default_rng(1)))
+
+    def height(rotations):
+        return torch.einsum("qab,ab->q", rotations, target)
+
+    ends, heights = ascend(height, starts, stride=0.5, steps=60)
+    assert (heights >= height(starts)).all()
+    assert np.degrees(so3.angle_between(ends.numpy(), target.numpy())).max() < 1

@@ -1,0 +1,193 @@
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from relpose_ros.estimates import Evidence, Verdict
+from relpose_ros.geometry import so3
+from relpose_ros.inference.calibration import Calibration
+from relpose_ros.inference.global_rotations import solve
+from relpose_ros.inference.pair_distribution import search
+from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
+from relpose_ros.inference.uncertainty import FLOOR, UNIFORM_VARIANCE, camera_covariances, describe_pairs
+from relpose_ros.inference.verdict import judge
+
+
+UNCALIBRATED = Calibration()
+
+
+def told(scene, calibration=UNCALIBRATED, translations=None):
+    """Pairs, covariances and the solution of a scene."""
+    if translations is None:
+        translations = np.tile([0.0, 0.0, 1.0], (len(scene), 1))
+    with torch.no_grad():
+        energies = PairEnergies.of(scene, scene, len(scene))
+        distributions = search(energies, GridEmbeddings(scene))
+        solutions = solve(energies, distributions)
+        pairs = describe_pairs(distributions, energies, solutions.rotations[0], calibration)
+        covariances = camera_covariances(energies, solutions, translations, calibration)
+    return pairs, covariances, solutions.rotations[0].numpy()
+
+
+def test_a_sharp_pair_has_the_covariance_of_its_density(fisher_scene, cameras_around):
+    """Near its mode the energy is -k |w|^2: a Gaussian of variance 1 / 2k per axis."""
+    (pair,), _, _ = told(fisher_scene(cameras_around(2, 0), concentration=20.0))
+    np.testing.assert_allclose(pair.covariance, np.eye(3) / 40, atol=0.004)
+    np.testing.assert_allclose(pair.modes[0].covariance, pair.covariance, atol=0.004)
+    assert pair.evidence is Evidence.LEARNED
+    assert not pair.ambiguous
+    assert pair.ambiguity_angle == 0
+    assert pair.solution_angle < 1e-2
+    assert pair.entropy < -3
+
+
+@pytest.mark.parametrize("concentration", [5.0, 20.0, 80.0])
+def test_probability_within_15_degrees_is_that_of_the_density(fisher_scene, cameras_around, concentration):
+    (pair,), _, _ = told(fisher_scene(cameras_around(2, 1), concentration))
+    angles = np.linspace(0, math.pi, 20_001)
+    density = np.exp(2 * concentration * (np.cos(angles) - 1)) * (1 - np.cos(angles))
+    inside = density[angles <= math.radians(15)].sum() / density.sum()
+    assert pair.probability_within_15_deg == pytest.approx(inside, abs=0.05)
+    assert pair.solution_probability == pytest.approx(inside, abs=0.05)
+
+
+def test_temperature_spreads_a_pair(fisher_scene, cameras_around):
+    scene = fisher_scene(cameras_around(2, 2), concentration=20.0)
+    (pair,), _, _ = told(scene, Calibration(temperature=4.0))
+    np.testing.assert_allclose(pair.covariance, np.eye(3) / 10, atol=0.02)
+
+
+def test_a_flat_pair_knows_nothing_and_is_not_called_ambiguous(fisher_scene, cameras_around):
+    (pair,), covariances, _ = told(fisher_scene(cameras_around(2, 3), concentration=0.0))
+    assert pair.entropy == pytest.approx(0, abs=1e-6)
+    assert pair.probability_within_15_deg < 0.01
+    assert not pair.ambiguous
+    np.testing.assert_allclose(pair.covariance, UNIFORM_VARIANCE * np.eye(3), rtol=0.1, atol=0.05)
+    assert np.linalg.eigvalsh(covariances[1, 3:, 3:])[0] > 0.8 * UNIFORM_VARIANCE
+
+
+@given(angle=st.floats(60, 180), share=st.floats(0.25, 0.48), seed=st.integers(0, 1000))
+@settings(max_examples=12)
+def test_a_symmetric_pair_is_ambiguous_by_its_angle_and_weights(fisher_scene_type, angle, share, seed):
+    scene_type, cameras_around = fisher_scene_type
+    scene = scene_type(cameras_around(2, seed))
+    true = scene.relative(0, 1)
+    other = so3.exp([0, math.radians(angle), 0]) @ true
+    scene.mixtures[0, 1] = [(true, math.log(1 - share), 60.0), (other, math.log(share), 60.0)]
+    (pair,), covariances, _ = told(scene)
+    assert pair.ambiguous
+    assert math.degrees(pair.ambiguity_angle) == pytest.approx(angle, abs=3)
+    assert [mode.weight for mode in pair.modes[:2]] == pytest.approx([1 - share, share], abs=0.08)
+    # The other explanation is a turn about camera 1's y axis, and shows in its variance.
+    own = scene.cameras[1] @ covariances[1, 3:, 3:] @ scene.cameras[1].T
+    assert own[1, 1] > 0.5 * share * math.radians(angle) ** 2
+    assert own[1, 1] > 5 * own[0, 0]
+
+
+def test_covariance_follows_curvature_and_grows_where_views_are_fewer_tied(fisher_scene, cameras_around):
+    """A chain 0-1-2 whose pair 0-2 says nothing: each link adds its variance."""
+    scene = fisher_scene(cameras_around(3, 4), concentration=50.0)
+    scene.mixtures[0, 2] = [(np.eye(3), 0.0, 0.0)]
+    _, covariances, _ = told(scene)
+    # The joint energy is divided by N / 2, so a link of variance 1 / 2k counts as 1.5 / 2k.
+    np.testing.assert_allclose(covariances[1, 3:, 3:], np.eye(3) * 1.5 / 100, atol=0.002)
+    np.testing.assert_allclose(covariances[2, 3:, 3:], np.eye(3) * 3.0 / 100, atol=0.004)
+
+
+@given(
+    seed=st.integers(0, 1000),
+    views=st.integers(2, 4),
+    concentration=st.sampled_from([0.0, 1.0, 30.0, 1000.0]),
+)
+@settings(max_examples=8)
+def test_covariances_are_never_placeholders(fisher_scene_type, seed, views, concentration):
+    scene_type, cameras_around = fisher_scene_type
+    translations = np.random.default_rng(seed).normal([0, 0, 1], 0.1, (views, 3))
+    _, covariances, _ = told(
+        scene_type(cameras_around(views, seed), concentration), translations=translations
+    )
+    for covariance in covariances:
+        np.testing.assert_array_equal(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance)[0] > 1e-8
+        assert np.linalg.eigvalsh(covariance[3:, 3:])[0] >= FLOOR**2 * 0.999
+        assert not np.allclose(covariance, np.eye(6))
+    np.testing.assert_allclose(covariances[0, 3:, 3:], FLOOR**2 * np.eye(3), atol=1e-12)
+
+
+def test_position_and_rotation_covary_as_a_camera_on_a_lever(fisher_scene, cameras_around):
+    """Against a sample: turns of the camera about the object move its centre too."""
+    scene = fisher_scene(cameras_around(2, 5), concentration=200.0)
+    translations = np.array([[0.0, 0.0, 1.0], [0.1, -0.05, 2.0]])
+    calibration = Calibration(translation_sigma=(0.01, 0.02, 0.05))
+    _, covariances, rotations = told(scene, calibration, translations)
+    rng = np.random.default_rng(0)
+    turns = rng.normal(0, math.sqrt(1 / 400), (40_000, 3))  # of the camera, in its own axes
+    shifts = rng.normal(0, calibration.translation_sigma, (40_000, 3))
+    turned = so3.exp(turns) @ rotations[1]
+    centres = -np.einsum("nji,nj->ni", turned, translations[1] + shifts)
+    seen = so3.log(turned.transpose(0, 2, 1) @ rotations[1])  # fixed axes of the object
+    sample = np.cov(np.concatenate([centres, seen], 1).T)
+    np.testing.assert_allclose(covariances[1], sample, atol=0.06 * np.abs(sample).max())
+
+
+def test_enough_needs_trusted_pairs_and_calibrated_ones(fisher_scene, cameras_around):
+    pairs, covariances, _ = told(fisher_scene(cameras_around(3, 6), concentration=150.0))
+    verdict, _, words = judge(pairs, covariances, calibrated=True)
+    assert verdict is Verdict.ENOUGH
+    assert words.startswith("enough: 3 of 3 pairs agree")
+    verdict, _, words = judge(pairs, covariances, calibrated=False)
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert "not calibrated" in words
+
+
+def test_the_verdict_names_the_ambiguous_pair(fisher_scene, cameras_around):
+    """View 2 is tied by pairs that cannot tell front from back."""
+    scene = fisher_scene(cameras_around(3, 7), concentration=150.0)
+    flip = so3.exp([0, math.pi, 0])
+    for i in (0, 1):
+        true = scene.relative(i, 2)
+        scene.mixtures[i, 2] = [(true, 0.0, 150.0), (flip @ true, 0.0, 150.0)]
+    pairs, covariances, _ = told(scene)
+    verdict, weakest, words = judge(pairs, covariances, calibrated=True)
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert (pairs[weakest].i, pairs[weakest].j) in [(0, 2), (1, 2)]
+    assert words == f"one more view: pair {pairs[weakest].i}-2 is ambiguous by about 180 degrees"
+
+
+def test_a_chain_of_good_pairs_is_enough(fisher_scene, cameras_around):
+    """Pair 0-2 says nothing, and need not: 0-1 and 1-2 do."""
+    scene = fisher_scene(cameras_around(3, 8), concentration=300.0)
+    scene.mixtures[0, 2] = [(np.eye(3), 0.0, 0.0)]
+    pairs, covariances, _ = told(scene)
+    verdict, weakest, _ = judge(pairs, covariances, calibrated=True)
+    assert verdict is Verdict.ENOUGH
+    assert (pairs[weakest].i, pairs[weakest].j) == (0, 2)
+
+
+def test_contradicting_pairs_are_not_enough(fisher_scene, cameras_around):
+    """Three sharp pairs around a loop that does not close."""
+    scene = fisher_scene(cameras_around(3, 9), concentration=100.0)
+    lie = so3.exp([2.0, 0, 0]) @ scene.relative(0, 2)
+    scene.mixtures[0, 2] = [(lie, 0.0, 100.0)]
+    pairs, covariances, _ = told(scene)
+    verdict, _, words = judge(pairs, covariances, calibrated=True)
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert "contradicts the others" in words
+
+
+def test_flat_pairs_are_not_enough(fisher_scene, cameras_around):
+    pairs, covariances, _ = told(fisher_scene(cameras_around(4, 10), concentration=0.2))
+    verdict, _, words = judge(pairs, covariances, calibrated=True)
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert "hardly anything" in words
+
+
+def test_pairs_come_in_order(fisher_scene, cameras_around):
+    pairs, _, _ = told(fisher_scene(cameras_around(4, 11)))
+    assert [(pair.i, pair.j) for pair in pairs] == list(itertools.combinations(range(4), 2))
