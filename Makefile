@@ -42,6 +42,7 @@ bags: setup
 	@rm -rf out/bags
 	$(BIN)/relpose_ros render out/bags --as demo-bags
 	@for each in out/bags/*; do rm -rf bags/$${each##*/} && mv $$each bags/ || exit; done
+	@rmdir out/bags
 
 clean:
 	rm -rf build dist install log out *.egg-info .coverage .mypy_cache .pytest_cache .ruff_cache

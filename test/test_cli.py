@@ -110,7 +110,7 @@ def test_ctrl_c_is_no_defect(monkeypatch):
     assert cli.main(["convert", "a", "--output", "b"]) == 130
 
 
-def test_the_commands_need_no_ros():
+def test_the_commands_need_no_ros(tmp_path):
     """Only `node` does: a laptop without ROS replays bags."""
     code = (
         "import sys\n"
@@ -118,7 +118,8 @@ def test_the_commands_need_no_ros():
         "from relpose_ros import cli\n"
         "sys.exit(cli.main(['replay', 'missing_bag', '--output', 'out']))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "missing_bag does not exist" in done.stderr
 
