@@ -69,7 +69,8 @@ class TrainingSettings:
     average_images: int = 20_000
     """Images over which the averaged weights, those that are measured and written, forget."""
     curriculum: tuple[tuple[float, float], ...] = ((0.0, 45.0), (0.25, 90.0), (0.5, 180.0))
-    """(share of the run, degrees): from then on, views of a scan lie within that angle of one of them."""
+    """(share of the run, degrees): views of a scan lie within an angle of one of them, which is drawn
+    for each step between the first of these and the one that the run has come to."""
     precision: str = "bfloat16"
     """Of the forward pass: float32, bfloat16, or float16 (GPU)."""
     objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
@@ -368,7 +369,9 @@ class _Plans:
         while images < settings.images:
             generator = np.random.default_rng([settings.seed, step])
             views = int(generator.integers(settings.min_views, settings.max_views + 1))
-            yield _Plan(step, views, _max_angle(settings, images))
+            # Near views go on being practised when far ones have begun.
+            angle = float(generator.uniform(settings.curriculum[0][1], _max_angle(settings, images)))
+            yield _Plan(step, views, angle)
             images += _scans_of(settings, views) * views * self._processes
             step += 1
 
