@@ -6,6 +6,7 @@ between processor and driver cost more than the pixels.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -63,6 +64,9 @@ class Renderer:
     def __init__(self) -> None:
         import moderngl
 
+        # Mesa's software renderer with threads of its own was seen to stall, and to crash, once in tens of
+        # thousands of pictures. Without them it draws in this thread; who wants more starts more processes.
+        os.environ.setdefault("LP_NUM_THREADS", "0")
         try:
             self._gl = moderngl.create_context(require=330, standalone=True, backend="egl")  # type: ignore[arg-type]
         except Exception as err:  # glcontext raises bare Exception and ValueError alike

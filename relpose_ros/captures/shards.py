@@ -22,16 +22,19 @@ Shard k holds the scans k M to k M + M - 1 of its seed; a shard that stands in i
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import shutil
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from tqdm import tqdm
 
 from relpose_ros.captures.assets import load_assets
+from relpose_ros.captures.renderer import RenderError
 from relpose_ros.captures.scans import PLACE_STRIDE, RenderedScan, ScanRenderer
 from relpose_ros.captures.scenes import Motion, ScanStyle
 
@@ -39,6 +42,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     import numpy.typing as npt
+
+
+_LOG = logging.getLogger(__name__)
+_MAX_FRUITLESS = 3
+"""So many times in a row all processes may die before a shard is whole."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +67,8 @@ class ShardPlan:
 def write_shards(folder: Path, count: int, plan: ShardPlan, *, processes: int = 1) -> None:
     """Write shards 0 to count - 1 of a plan; those that stand already are left alone.
 
+    It starts processes: a script calls it under ``if __name__ == "__main__"``.
+
     Args:
         folder: Gets one sub-folder per shard, ``00000`` and on.
         count: Shards.
@@ -66,21 +76,47 @@ def write_shards(folder: Path, count: int, plan: ShardPlan, *, processes: int = 
         processes: Each opens its own OpenGL context.
 
     Raises:
-        RenderError: There is no OpenGL here.
+        RenderError: There is no OpenGL here, or all that draws dies.
         AssetsError: The assets folder is not one.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    missing = [k for k in range(count) if not (folder / f"{k:05d}").exists()]
-    task = partial(_write_shard, folder, plan)
-    progress = partial(tqdm, total=len(missing), unit="shard", desc=f"{plan.scans * plan.views} images each")
-    if processes <= 1:
-        for _ in progress(map(task, missing)):
-            pass
-        return
+    missing = _missing(folder, count)
+    with tqdm(total=len(missing), unit="shard", desc=f"{plan.scans * plan.views} images each") as progress:
+        fruitless = 0
+        while missing:
+            done = _write_some(folder, plan, missing, processes, progress)
+            fruitless = 0 if done else fruitless + 1
+            if fruitless == _MAX_FRUITLESS:
+                text = f"the processes that draw shards of {folder} die; the graphics driver may be at fault."
+                raise RenderError(text)
+            missing = _missing(folder, count)
+
+
+def _missing(folder: Path, count: int) -> list[int]:
+    return [k for k in range(count) if not (folder / f"{k:05d}").exists()]
+
+
+def _write_some(
+    folder: Path, plan: ShardPlan, numbers: list[int], processes: int, progress: tqdm[NoReturn]
+) -> int:
+    """Write shards until all stand or a process dies, and return how many."""
+    done = 0
     # A forked process would share its parent's OpenGL connection.
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        for _ in progress(pool.imap_unordered(task, missing)):
-            pass
+    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+        futures = [pool.submit(_write_shard, folder, plan, number) for number in numbers]
+        try:
+            for future in as_completed(futures):
+                future.result()
+                done += 1
+                progress.update()
+        except BrokenProcessPool:
+            # A graphics driver that crashes once in tens of thousands of pictures costs the shard at hand,
+            # not the night: what is missing is drawn by new processes.
+            _LOG.warning("a process that drew shards of %s died; going on with a new one.", folder)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return done
 
 
 def read_shard(folder: Path) -> dict[str, npt.NDArray[Any]]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import threading
+import time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -65,12 +68,20 @@ def test_objects_are_in_their_crops(scans: ScanRenderer) -> None:
     assert np.median(shares) > 0.15
 
 
-def test_shards_hold_the_scans_and_are_continued(scans: ScanRenderer, tmp_path: Path) -> None:
+def test_shards_are_continued_though_a_process_dies(scans: ScanRenderer, tmp_path: Path) -> None:
     plan = ShardPlan(seed=3, scans=2, views=3, image_size=SIZE)
     write_shards(tmp_path, 1, plan)
     before = (tmp_path / "00000/images.npy").stat().st_mtime_ns
-    (tmp_path / "00001.unfinished").mkdir()
+
+    def kill_one() -> None:
+        while not list(tmp_path.glob("*.unfinished")):
+            time.sleep(0.01)
+        multiprocessing.active_children()[0].kill()
+
+    killer = threading.Thread(target=kill_one)
+    killer.start()
     write_shards(tmp_path, 2, plan)
+    killer.join()
     assert (tmp_path / "00000/images.npy").stat().st_mtime_ns == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["00000", "00001"]
     shard = read_shard(tmp_path / "00001")
