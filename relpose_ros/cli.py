@@ -25,7 +25,6 @@ EXTRA_OF_MODULE = {
     "moderngl": "train",
     "trimesh": "train",
     "pycolmap": "evaluate",
-    "scipy": "evaluate",
 }
 """Which extra brings a module that only some commands need."""
 
