@@ -153,7 +153,7 @@ def make_batch(
             if within:
                 break
         scan = _Scan(
-            images=np.asarray(row["images"][chosen], np.float32) / 255,
+            images=np.asarray(row["images"][chosen], np.float32) / np.float32(255),
             places=np.asarray(row["places"][chosen], np.float32),
             crops=np.asarray(row["crop_parameters"][chosen], np.float64),
             poses=np.asarray(row["camera_from_object"][chosen], np.float64),

@@ -513,10 +513,16 @@ def _join(device: torch.device) -> tuple[int, int]:
 
 
 def _moved(targets: Targets, device: torch.device) -> Targets:
-    tensors = {
-        name: value.to(device) for name, value in vars(targets).items() if isinstance(value, torch.Tensor)
-    }
-    return replace(targets, **tensors)
+    return replace(
+        targets,
+        true=targets.true.to(device),
+        uniform=targets.uniform.to(device),
+        near=targets.near.to(device),
+        log_density=targets.log_density.to(device),
+        rotations=targets.rotations.to(device),
+        translations=targets.translations.to(device),
+        places=None if targets.places is None else targets.places.to(device),
+    )
 
 
 def _cut_curve(path: Path, step: int) -> None:

@@ -98,9 +98,7 @@ def test_the_identity_is_right_only_for_near_neighbours():
 def test_evaluate_writes_rows_and_their_mean(tmp_path):
     output = tmp_path / "rows.json"
     sequences = [posed(name="one"), posed(name="two", seed=1)]
-    rows = protocol.evaluate(
-        sequences, [2, 3], methods=["identity"], output=output, orders=2, progress=False
-    )
+    rows = protocol.evaluate(sequences, [2, 3], methods=["identity"], output=output, orders=2, progress=False)
     assert [row["capture"] for row in rows] == ["one", "one", "two", "two", "mean", "mean"]
     for key in ("rotation@15", "rotation@auc60", "center@0.2", "seconds"):
         assert rows[5][key] == pytest.approx((rows[1][key] + rows[3][key]) / 2)
@@ -123,9 +121,7 @@ def test_wrong_questions_are_answered_with_a_sentence():
 
 def test_only_photos_with_a_pose_are_measured_on(tmp_path):
     sequence = posed(3)
-    frames = [
-        Frame(sequence.view(k), None if k == 1 else sequence.camera_from_world[k]) for k in range(3)
-    ]
+    frames = [Frame(sequence.view(k), None if k == 1 else sequence.camera_from_world[k]) for k in range(3)]
     capture = save_capture(tmp_path / "thing", frames)
     views = protocol.posed_views(capture)
     assert views.name == "thing"
@@ -144,7 +140,9 @@ def test_colmap_recovers_a_textured_scene():
     # Two textured planes at an angle, drawn by their homographies.
     generator = np.random.default_rng(0)
     textures = [
-        cv2.resize(generator.integers(0, 256, (64, 64, 3), dtype=np.uint8), (512, 512), interpolation=cv2.INTER_CUBIC)
+        cv2.resize(
+            generator.integers(0, 256, (64, 64, 3), dtype=np.uint8), (512, 512), interpolation=cv2.INTER_CUBIC
+        )
         for _ in range(2)
     ]
     planes = [  # corner and two edges of a square of side 2

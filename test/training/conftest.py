@@ -13,7 +13,9 @@ def make_shard(scans, views, size, seed):
     """Random pictures with consistent poses: cameras on a sphere that look at the origin, roughly upright."""
     generator = np.random.default_rng(seed)
     rotations = so3.random_rotations(scans * views, generator).reshape(scans, views, 3, 3)
-    translations = np.broadcast_to([0.0, 0.0, 3.0], (scans, views, 3)) + generator.normal(0, 0.1, (scans, views, 3))
+    translations = np.broadcast_to([0.0, 0.0, 3.0], (scans, views, 3)) + generator.normal(
+        0, 0.1, (scans, views, 3)
+    )
     cells = size // 8
     places = generator.normal(size=(scans, views, cells, cells, 3)).astype(np.float16)
     places[generator.random((scans, views, cells, cells)) < 0.3] = np.nan

@@ -15,13 +15,15 @@ SIZE, WIDTH, HEIGHT = 32, 64, 48
 
 
 def true_scan(seed, views=3):
-    """Views whose ``places`` are the object points that each cell of the crop shows, by projecting a sphere."""
+    """Views of a sphere whose ``places`` are the object points that each cell of the crop shows."""
     generator = np.random.default_rng(seed)
     directions = generator.normal(size=(views, 3))
     centres = 4 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     rotation = look_at(centres, generator.normal(0, 0.3, (views, 3)), generator.normal(size=3))
     translation = -np.einsum("nij,nj->ni", rotation, centres)
-    crops = np.column_stack([generator.integers(5, 20, (views, 2)), generator.integers(20, 30, views)]).astype(float)
+    crops = np.column_stack(
+        [generator.integers(5, 20, (views, 2)), generator.integers(20, 30, views)]
+    ).astype(float)
     focal = 50.0
     cells = SIZE // 8
     ticks = (np.arange(cells) + 0.5) / cells
@@ -118,7 +120,8 @@ def test_a_batch_is_the_same_for_the_same_seed_and_another_for_another(fake_shar
     scans = Scans([fake_shard(4, 6, 32, 0), fake_shard(3, 5, 32, 1)])
     assert len(scans) == 7
     draw = [
-        batches.make_batch(scans, 5, 3, 90.0, np.random.default_rng(seed), Augmentation()) for seed in (1, 1, 2)
+        batches.make_batch(scans, 5, 3, 90.0, np.random.default_rng(seed), Augmentation())
+        for seed in (1, 1, 2)
     ]
     assert draw[0].images.shape == (5, 3, 3, 32, 32)
     assert draw[0].images.equal(draw[1].images)

@@ -1,4 +1,4 @@
-"""The objective: samples with the density they claim, a likelihood that does not depend on how it is sampled."""
+"""The objective: samples with the density they claim, a likelihood however it is sampled."""
 
 import math
 
@@ -19,9 +19,11 @@ seeds = st.integers(0, 2**32 - 1)
 def batch_of(seed, scans=2, views=4):
     generator = np.random.default_rng(seed)
     rotation = so3.random_rotations(scans * views, generator).reshape(scans, views, 3, 3)
-    translation = generator.normal(size=(scans, views, 3, 1)) + [[0.0], [0.0], [3.0]]
+    translation = generator.normal(size=(scans, views, 3, 1)) + np.array([[0.0], [0.0], [3.0]])
     return Batch(
-        torch.zeros(scans, views, 3, 8, 8), torch.zeros(scans, views, 3), np.concatenate([rotation, translation], -1)
+        torch.zeros(scans, views, 3, 8, 8),
+        torch.zeros(scans, views, 3),
+        np.concatenate([rotation, translation], -1),
     )
 
 
@@ -54,7 +56,9 @@ def test_the_mixture_is_a_density(uniform, near, radii):
 
 
 def test_an_energy_that_knows_nothing_scores_zero_with_uniform_samples():
-    assert objective.rotation_loss(torch.full((3, 5, 100), 7.0), torch.zeros(3, 5, 100)).item() == pytest.approx(0, abs=1e-5)
+    assert objective.rotation_loss(
+        torch.full((3, 5, 100), 7.0), torch.zeros(3, 5, 100)
+    ).item() == pytest.approx(0, abs=1e-5)
 
 
 def test_with_uniform_samples_it_is_the_published_cross_entropy():
@@ -65,7 +69,7 @@ def test_with_uniform_samples_it_is_the_published_cross_entropy():
 
 
 def test_samples_near_the_truth_estimate_the_same_likelihood():
-    # An energy with a peak of about 20 degrees at the truth; its likelihood by brute force on many uniform samples.
+    # An energy with a peak of about 20 degrees at the truth; its likelihood by brute force.
     def energy(angle):
         return torch.from_numpy(-0.5 * (angle / 0.35) ** 2)
 
@@ -118,7 +122,10 @@ def test_targets_are_those_of_the_poses(seed):
 
 def test_translations_in_the_first_camera_s_frame_put_that_camera_at_the_origin():
     targets = objective.make_targets(
-        batch_of(3), ObjectiveSettings(uniform_rotations=2), np.random.default_rng(0), translation_frame="first_camera"
+        batch_of(3),
+        ObjectiveSettings(uniform_rotations=2),
+        np.random.default_rng(0),
+        translation_frame="first_camera",
     )
     np.testing.assert_allclose(targets.translations[:, 0], 0, atol=1e-6)
 

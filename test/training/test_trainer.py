@@ -1,4 +1,4 @@
-"""The loop: it learns, it resumes to the same weights, it stops in time, its checkpoints survive being cut."""
+"""The loop: it learns, resumes to the same weights, stops in time, and its checkpoints survive being cut."""
 
 import csv
 import os
