@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from relpose_ros.geometry import so3
-from relpose_ros.inference.pair_distribution import ascend, peaks
+from relpose_ros.inference.pair_distribution import ascend, peaks, pick
 
 if TYPE_CHECKING:
     from relpose_ros.inference.pair_distribution import PairDistributions
@@ -43,7 +43,7 @@ class AscentSettings:
     """Places considered for a camera in such a sweep: so many modes, and so many cells of the coarse grid."""
     hop_steps: int = 6
     """Gradient steps at each before they are compared."""
-    radii: tuple[float, ...] = tuple(math.radians(a) for a in (8, 4, 2))
+    radii: tuple[float, ...] = tuple(math.radians(a) for a in (12, 8, 5, 3, 2, 1))
     """Neighbourhood of each sweep over the cameras, rad."""
     last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (2, 1, 0.5, 0.25))
     """The same for the best climber alone, at the end."""
@@ -238,8 +238,8 @@ def _jump(
         guesses = _coarse_conditional(energies, distributions, moving, camera, others)
         starts = torch.cat(
             [
-                peaks(modes, gains, settings.hops, settings.distinct)[0],
-                peaks(cells, guesses, settings.hops, settings.distinct)[0],
+                pick(modes, peaks(modes, gains, settings.hops, settings.distinct)[0]),
+                pick(cells, peaks(cells, guesses, settings.hops, settings.distinct)[0]),
             ],
             1,
         )
@@ -263,7 +263,8 @@ def _climb_camera(
     def height(places: torch.Tensor) -> torch.Tensor:
         return _conditional(energies, rotations, camera, others, places.view_as(starts)).flatten()
 
-    hills, heights = ascend(height, starts.flatten(0, 1), settings.climb_stride, settings.hop_steps)
+    strides = torch.full((starts.shape[0] * starts.shape[1],), settings.climb_stride, dtype=torch.float64)
+    hills, heights = ascend(height, starts.flatten(0, 1), strides, settings.hop_steps)
     return hills.view_as(starts), heights.view(starts.shape[:2])
 
 

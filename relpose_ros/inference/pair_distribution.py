@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
 from relpose_ros.geometry import so3, so3_grid
@@ -29,14 +28,14 @@ class SearchSettings:
 
     level: int = 1
     """The level evaluated in full: 72 * 8^level cells a pair, 30 degrees apart at level 1."""
-    widths: tuple[int, ...] = (64, 64)
-    """Cells split at that level and at each one below it."""
+    widths: tuple[int, ...] = (64, 24, 8, 8)
+    """Cells split at that level and at each one below it: cells of 2 degrees at the end."""
     modes: int = 8
     """Modes looked for a pair."""
     separation: float = math.radians(25)
-    """Modes nearer than this are one, rad: the cells of the coarse level are that far apart."""
-    refinement_steps: int = 12
-    """Gradient steps a mode; each halves its stride when it overshoots."""
+    """Modes nearer than this are one, rad: the cells of the coarse level are about that far apart."""
+    refinement_steps: int = 8
+    """Gradient steps a mode, the first of half a cell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,25 +90,33 @@ def search(
         cells = (cells[:, :width, None] * 8 + torch.arange(8)).flatten(1)
         ancestors = ancestors[:, :width].repeat_interleave(8, 1)
         level += 1
-        values = energies.on_cells(grid(level), cells)
+        values = energies.on_cells(grid, level, cells)
         coarse = coarse.scatter_reduce(1, ancestors, values.double(), "amax")
     kept.append((level, cells, values))
 
-    rotations = torch.cat([_grid_tensor(at)[index] for at, index, _ in kept], 1)
+    rotations = torch.cat([_rotations(at, index) for at, index, _ in kept], 1)
     scores = torch.cat([value for _, _, value in kept], 1).double()
     levels = [at for at, index, _ in kept for _ in range(index.shape[1])]
     log_volumes = torch.tensor([-math.log(so3_grid.size(at)) for at in levels], dtype=torch.float64)
     spacings = torch.tensor([so3_grid.cell_spacing(at) for at in levels], dtype=torch.float64)
-    tops = peaks(rotations, scores, settings.modes, settings.separation)
-    modes, mode_energies = _refine_modes(energies, *tops, so3_grid.cell_spacing(level), settings)
-    coarse_rotations = _grid_tensor(settings.level)
+    tops, heights = peaks(rotations, scores, settings.modes, settings.separation)
+    modes, mode_energies = _refine_modes(
+        energies, pick(rotations, tops), heights, spacings[tops] / 2, settings
+    )
+    coarse_rotations = _rotations(settings.level, torch.arange(so3_grid.size(settings.level)))
     return PairDistributions(
         rotations, scores, log_volumes, spacings, coarse, coarse_rotations, modes, mode_energies
     )
 
 
-def _grid_tensor(level: int) -> torch.Tensor:
-    return torch.from_numpy(np.array(so3_grid.grid(level)))
+def _rotations(level: int, cells: torch.Tensor) -> torch.Tensor:
+    """Centres of cells. (..., C) int64 -> (..., C, 3, 3)."""
+    return torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
+
+
+def pick(rotations: torch.Tensor, positions: torch.Tensor) -> torch.Tensor:
+    """In each row the rotations at some positions. (P, L, 3, 3), (P, M) int64 -> (P, M, 3, 3)."""
+    return torch.gather(rotations, 1, positions[..., None, None].expand(-1, -1, 3, 3))
 
 
 def peaks(
@@ -124,7 +131,7 @@ def peaks(
         separation: rad.
 
     Returns:
-        Rotations (P, M, 3, 3), highest first, and values (P, M), -inf where a row has no more.
+        Positions (P, M) int64, highest first, and values (P, M), -inf where a row has no more.
     """
     least_trace = 1 + 2 * math.cos(separation)
     flat = rotations.flatten(2)  # (P, L, 9): the trace of A B^T is their scalar product
@@ -133,7 +140,7 @@ def peaks(
     tops, heights = [], []
     for _ in range(count):
         best = left.argmax(1)
-        tops.append(rotations[rows, best])
+        tops.append(best)
         heights.append(left[rows, best])
         traces = torch.einsum("pla,pa->pl", flat, flat[rows, best])
         left = left.masked_fill(traces > least_trace, -math.inf)
@@ -145,7 +152,7 @@ def _refine_modes(
     energies: PairEnergies,
     modes: torch.Tensor,
     values: torch.Tensor,
-    spacing: float,
+    strides: torch.Tensor,
     settings: SearchSettings,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     count = modes.shape[1]
@@ -153,22 +160,22 @@ def _refine_modes(
     refined, best = ascend(
         lambda rotations: energies.at(pairs, rotations[:, None])[:, 0],
         modes.flatten(0, 1),
-        stride=spacing / 2,
-        steps=settings.refinement_steps,
+        strides.flatten(),
+        settings.refinement_steps,
     )
     refined, best = refined.view_as(modes), best.view_as(values).masked_fill(values == -math.inf, -math.inf)
     best, order = torch.sort(best, dim=1, descending=True, stable=True)
-    refined = torch.gather(refined, 1, order[..., None, None].expand_as(refined))
+    refined = pick(refined, order)
     # Two starts may have climbed the same hill: the lower one is no mode of its own.
     traces = torch.einsum("pmab,pnab->pmn", refined, refined)
     same = torch.tril(traces > 1 + 2 * math.cos(settings.separation), diagonal=-1).any(-1)
     best = best.masked_fill(same, -math.inf)
     best, order = torch.sort(best, dim=1, descending=True, stable=True)
-    return torch.gather(refined, 1, order[..., None, None].expand_as(refined)), best
+    return pick(refined, order), best
 
 
 def ascend(
-    height: Callable[[torch.Tensor], torch.Tensor], rotations: torch.Tensor, stride: float, steps: int
+    height: Callable[[torch.Tensor], torch.Tensor], rotations: torch.Tensor, strides: torch.Tensor, steps: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Climbs many rotations at once, each along its own gradient on the tangent space.
 
@@ -178,7 +185,7 @@ def ascend(
     Args:
         height: of each rotation, (Q, 3, 3) -> (Q,), differentiable.
         rotations: (Q, 3, 3) float64 starts.
-        stride: first step, rad.
+        strides: (Q,) first steps, rad.
         steps: how many.
 
     Returns:
@@ -186,7 +193,7 @@ def ascend(
     """
     here = rotations
     value, slope = _slope(height, here)
-    length = torch.full_like(value, stride)
+    length = strides
     for _ in range(steps):
         direction = slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-12)
         there = so3.exp_tensor(direction * length[:, None]) @ here

@@ -18,6 +18,9 @@ from relpose_ros.geometry import so3_grid
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+LAST_KEPT_LEVEL = 2
+"""Whole levels are kept up to this one: 5 MB at the published size. The next would be 38 MB, of which a scan
+looks at a few per cent."""
 ROWS = 1024
 """Rotations scored in one go: 1024 rows of 256 floats are 1 MB, and stay in a core's cache between layers."""
 
@@ -48,8 +51,15 @@ class GridEmbeddings:
         self._model = model
         self._levels: dict[int, torch.Tensor] = {}
 
+    def of_cells(self, level: int, cells: torch.Tensor) -> torch.Tensor:
+        """Embeddings of some cells of a level. (..., C) int64 -> (..., C, H)."""
+        if level <= LAST_KEPT_LEVEL:
+            return self(level)[cells]
+        rotations = torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
+        return self._model.embed_relative(rotations.float())
+
     def __call__(self, level: int) -> torch.Tensor:
-        """(72 * 8^level, H) embeddings of a whole level; 38 MB at level 3 of the published size."""
+        """(72 * 8^level, H) embeddings of a whole level."""
         if level not in self._levels:
             rotations = torch.from_numpy(np.array(so3_grid.grid(level))).float()
             parts = [self._model.embed_relative(part) for part in torch.split(rotations, ROWS)]
@@ -100,14 +110,14 @@ class PairEnergies:
                 )[0]
         return energies
 
-    def on_cells(self, embeddings: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
-        """Energies of every pair at its own cells. (K, H) of a level, (P, C) int64 -> (P, C)."""
+    def on_cells(self, grid: GridEmbeddings, level: int, cells: torch.Tensor) -> torch.Tensor:
+        """Energies of every pair at its own cells of a level. (P, C) int64 -> (P, C)."""
         energies = torch.empty(cells.shape, dtype=self.contexts.dtype)
         for pair in range(self.count):
             for start in range(0, cells.shape[1], ROWS):
                 part = slice(start, start + ROWS)
                 energies[pair, part] = self.model.pair_energies(
-                    self.contexts[pair : pair + 1], embeddings[cells[pair, part]]
+                    self.contexts[pair : pair + 1], grid.of_cells(level, cells[pair, part])
                 )[0]
         return energies
 

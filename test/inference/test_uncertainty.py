@@ -18,7 +18,6 @@ from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 from relpose_ros.inference.uncertainty import FLOOR, UNIFORM_VARIANCE, camera_covariances, describe_pairs
 from relpose_ros.inference.verdict import judge
 
-
 UNCALIBRATED = Calibration()
 
 
