@@ -1,0 +1,214 @@
+"""What an estimate costs beside its encoder and beside RelPose++'s own procedure, N = 2 to 8.
+
+    python -m benchmarks.solver [--threads 2] [--presets paper compact] [--published-scale 1.0]
+    python -m benchmarks.solver --search-table
+
+The weights are random, with energies made smooth and peaked: no two pairs agree on anything, which is the
+hardest case for the solver (a camera whose pairs agree is left alone). Published procedure: rebuilt from its
+description and run in full at N = 3; for the other N its evaluations are counted and priced at the seconds
+per evaluation measured there. It scores with our own, cheaper head, which flatters it.
+
+Each preset runs in a process of its own, whose peak memory is then that of the largest N so far.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from benchmarks.encoder import timed
+from benchmarks.references import best_of_pair, published, published_evaluations
+from relpose_ros.inference.estimator import Estimator
+from relpose_ros.inference.pair_distribution import SearchSettings, search
+from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
+from relpose_ros.network.checkpoint import random_network
+from relpose_ros.network.features import SceneFeatures, ViewFeatures
+from relpose_ros.network.presets import PRESETS
+from relpose_ros.views import MAX_VIEWS, MIN_VIEWS, BoundingBox, Scan, View
+
+if TYPE_CHECKING:
+    from relpose_ros.network.relpose import RelPose
+
+HEADER = (
+    f"{'preset':8} {'N':>2}  {'encoder, s':>17}  {'estimate, s':>17}  {'ratio':>5}  "
+    f"{'one view more, s':>17}  {'published, s':>13}  {'times':>6}  peak, MiB"
+)
+SEARCHES = [
+    SearchSettings(level=level, widths=widths)
+    for level, widths in [
+        (1, ()),
+        (1, (16,)),
+        (1, (64,)),
+        (1, (8, 8)),
+        (1, (32, 32)),
+        (1, (64, 64)),
+        (1, (128, 128)),
+        (1, (16, 16, 16)),
+        (1, (32, 32, 32)),
+        (1, (64, 64, 64)),
+        (1, (32, 32, 32, 32)),
+        (2, ()),
+        (2, (64,)),
+        (2, (256,)),
+    ]
+]
+
+
+def peaked_network(preset: str, seed: int) -> RelPose:
+    """Random weights whose energies are smooth over the rotations, and have peaks of ten nats and more."""
+    network = random_network(preset, seed)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for layer in (network.embed_feature, network.embed_query, *network.layers[1::2], network.layers[4]):
+            deviation = math.sqrt(2 / layer.in_features)
+            layer.weight.copy_(deviation * torch.randn(layer.weight.shape, generator=generator))
+        octave = torch.arange(network.embed_query.in_features) % network.preset.rotation_frequencies
+        network.embed_query.weight *= 2.0**-octave
+        network.layers[4].weight *= 8
+    return network
+
+
+def noise_views(count: int) -> list[View]:
+    """Views of 640 x 480 noise."""
+    generator = np.random.default_rng(0)
+    return [
+        View(generator.integers(0, 256, (480, 640, 3), np.uint8), BoundingBox(150, 80, 430, 400), 640, 480)
+        for _ in range(count)
+    ]
+
+
+def fresh(views: list[View]) -> list[View]:
+    """The same pictures as views that no estimator has seen."""
+    return [View(view.image, view.box, view.full_width, view.full_height) for view in views]
+
+
+def words(seconds: tuple[float, float]) -> str:
+    return f"{seconds[0]:.3f} ({seconds[1]:.3f})".rjust(17)
+
+
+def spread(seconds: list[float]) -> tuple[float, float]:
+    return min(seconds), statistics.median(seconds)
+
+
+@torch.no_grad()
+def rows(name: str, repeats: int, scale: float) -> None:
+    """Prints the rows of one preset."""
+    network = peaked_network(name, 0)
+    size = network.preset.image_size
+    images = torch.randn(MAX_VIEWS, 3, size, size, generator=torch.Generator().manual_seed(0))
+    crops = torch.rand(MAX_VIEWS, 3, generator=torch.Generator().manual_seed(1))
+    views = noise_views(MAX_VIEWS)
+    estimator = Estimator(network)
+    estimator.estimate(Scan("warm-up", tuple(fresh(views))))
+    per_evaluation = price(network, images[:3], crops[:3], scale)
+    totals = []
+    for count in range(MIN_VIEWS, MAX_VIEWS + 1):
+
+        def encode(count: int = count) -> object:
+            looks = [network.look(images[view : view + 1])[0] for view in range(count)]
+            return network.relate(ViewFeatures.stack(looks), crops[:count])
+
+        encoder = timed(encode, repeats)
+        whole, more = [], []
+        for _ in range(repeats):
+            held = fresh(views[:count])
+            start = time.perf_counter()
+            estimator.estimate(Scan("whole", tuple(held)))
+            whole.append(time.perf_counter() - start)
+            last = fresh(views[count - 1 : count])
+            start = time.perf_counter()
+            estimator.estimate(Scan("more", tuple(held[:-1] + last)))
+            more.append(time.perf_counter() - start)
+        theirs = encoder[0] + per_evaluation * published_evaluations(count)
+        estimate = spread(whole)
+        totals.append(estimate[0])
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(
+            f"{name:8} {count:2}  {words(encoder)}  {words(estimate)}  {estimate[0] / encoder[0]:5.2f}  "
+            f"{words(spread(more))}  {theirs:12.1f}{' ' if count == 3 else '*'}  "
+            f"{theirs / estimate[0]:6.0f}  {peak:9.0f}",
+            flush=True,
+        )
+    counts = np.log(np.arange(MIN_VIEWS, MAX_VIEWS + 1))
+    power = np.polyfit(counts, np.log(totals), 1)[0]
+    print(f"{name:8} an estimate grows as N^{power:.1f}\n", flush=True)
+
+
+def price(network: RelPose, images: torch.Tensor, crops: torch.Tensor, scale: float) -> float:
+    """Seconds per evaluated energy in the published procedure, from a run with three views."""
+    features = network.relate(network.look(images), crops)
+    energies = PairEnergies.of(network, features, len(images))
+    start = time.perf_counter()
+    _, _, evaluated = published(energies, np.random.default_rng(0), scale)
+    return (time.perf_counter() - start) / evaluated
+
+
+@torch.no_grad()
+def search_table(pairs: int) -> None:
+    """Prints how often each way to search finds the highest energy of a pair, and what it evaluates."""
+    network = peaked_network("paper", 0)
+    tokens = torch.randn(2 * pairs, network.preset.token_width, generator=torch.Generator().manual_seed(2))
+    i, j = torch.arange(pairs), torch.arange(pairs) + pairs
+    features = SceneFeatures(tokens, None)
+    energies = PairEnergies(network, network.pair_contexts(features, i, j), i, j, 2 * pairs)
+    optimum = torch.tensor([best_of_pair(energies, pair, level=3)[1] for pair in range(pairs)])
+    grid = GridEmbeddings(network)
+    print(f"{pairs} pairs; found: at most 0.05 nats below a dense evaluation of 36,864 cells and lattices\n")
+    print("level  widths          evaluated a pair  found  worst miss, nats")
+    for settings in SEARCHES:
+        found = search(energies, grid, settings).mode_energies[:, 0]
+        misses = (optimum - found).clamp_min(0)
+        evaluated = 72 * 8**settings.level + sum(8 * width for width in settings.widths)
+        evaluated += settings.modes * (settings.refinement_steps + 1)
+        widths = ", ".join(map(str, settings.widths)) or "-"
+        share = float((misses <= 0.05).double().mean())
+        print(
+            f"{settings.level:5}  {widths:14}  {evaluated:16}  {share:5.0%}  {float(misses.max()):16.2f}",
+            flush=True,
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--presets", nargs="+", choices=list(PRESETS), default=list(PRESETS))
+    parser.add_argument(
+        "--published-scale", type=float, default=1.0, help="share of its proposals that is run"
+    )
+    parser.add_argument("--search-table", action="store_true", help="only the table of searches")
+    parser.add_argument("--pairs", type=int, default=60, help="in the table of searches")
+    parser.add_argument("--rows", action="store_true", help="the rows of the presets, in this process")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    if not 0 < arguments.published_scale <= 1:
+        parser.error(f"--published-scale is a share above 0 and up to 1, not {arguments.published_scale}")
+    if arguments.rows:
+        for name in arguments.presets:
+            rows(name, arguments.repeats, arguments.published_scale)
+        return
+    print(f"torch {torch.__version__}, {platform.machine()}, {arguments.threads} threads, float32")
+    if not arguments.search_table:
+        print(f"least (median) seconds of {arguments.repeats} after one to warm up; * by counted evaluations")
+        if not math.isclose(arguments.published_scale, 1):
+            print(f"published procedure priced on {arguments.published_scale:.0%} of its proposals")
+        print(f"\n{HEADER}", flush=True)
+        for name in arguments.presets:
+            own = [sys.executable, "-m", "benchmarks.solver", "--rows", "--presets", name]
+            own += ["--threads", str(arguments.threads), "--repeats", str(arguments.repeats)]
+            subprocess.run([*own, "--published-scale", str(arguments.published_scale)], check=True)
+    search_table(arguments.pairs)
+
+
+if __name__ == "__main__":
+    main()
