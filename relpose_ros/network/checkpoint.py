@@ -13,6 +13,7 @@ import pickle
 import re
 import warnings
 import zipfile
+from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -232,12 +233,13 @@ def _read_checkpoint(file: Path) -> Tensors:
 
 
 def _foreign_archive(file: Path) -> str | None:
-    """What a zip archive is, if it is whole and no PyTorch checkpoint."""
+    """What a zip archive is, if it is no PyTorch checkpoint."""
     try:
         with zipfile.ZipFile(file) as archive:
             names = archive.namelist()
     except zipfile.BadZipFile:
-        return None
+        # Not left to torch: what another reader makes of it has not been looked at here.
+        return "a damaged or truncated archive"
     if any(name.endswith(".npy") for name in names):
         return "a NumPy archive"
     if any(name.endswith("/constants.pkl") for name in names):
@@ -267,7 +269,13 @@ def _state_dict(content: Any, file: Path) -> Tensors:
         raise NetworkFileError(
             f"The weights file '{file}' has no state dict but {names or 'nothing'}; expected {_EXPECTED}."
         )
-    return {str(name).removeprefix("module."): value for name, value in state.items()}
+    bare = [str(name).removeprefix("module.") for name in state]
+    if twice := [name for name, times in Counter(bare).items() if times > 1]:
+        raise NetworkFileError(
+            f"The weights file '{file}' holds with and without 'module.' before the name {_listed(twice)}; "
+            f"expected {_EXPECTED}."
+        )
+    return dict(zip(bare, state.values(), strict=True))
 
 
 def _preset_metadata(preset: Preset) -> dict[str, str]:
@@ -290,9 +298,12 @@ def _stored_preset(metadata: Mapping[str, str], file: Path) -> Preset | None:
             settings = changes["correlation"]
             settings["layout_widths"] = tuple(settings["layout_widths"])
             changes["correlation"] = CorrelationSettings(**settings)
-        return replace(PRESETS.get(name, Preset(name)), **changes)
-    except (ValueError, TypeError, KeyError, AttributeError) as err:
-        text = f"The weights file '{file}' describes a network unknown here ({err}); update relpose_ros."
+        preset = replace(PRESETS.get(name, Preset(name)), **changes)
+        _expected(preset)
+        return preset
+    except Exception as err:  # numbers from a file can make the building of a network fail in any way
+        reason = " ".join(str(err).split())
+        text = f"The weights file '{file}' describes a network unknown here ({reason}); update relpose_ros."
         raise NetworkFileError(text) from err
 
 
@@ -308,9 +319,10 @@ def _guessed_preset(tensors: Tensors, file: Path) -> Preset:
     return PRESETS[best]
 
 
-def _expected(preset: Preset) -> dict[str, tuple[int, ...]]:
+def _expected(preset: Preset) -> Tensors:
+    """The state dict's names, shapes and types, without numbers."""
     with torch.device("meta"):
-        return {name: tuple(tensor.shape) for name, tensor in RelPose(preset).state_dict().items()}
+        return dict(RelPose(preset).state_dict())
 
 
 def _checked(tensors: Tensors, preset: Preset, file: Path) -> Tensors:
@@ -322,7 +334,7 @@ def _checked(tensors: Tensors, preset: Preset, file: Path) -> Tensors:
     expected = _expected(preset)
     tensors = dict(tensors)
     if _INDEX_TABLE in expected:
-        wanted = expected[_INDEX_TABLE]
+        wanted = tuple(expected[_INDEX_TABLE].shape)
         table = tensors.get(_INDEX_TABLE)
         longer = table is not None and table.ndim == 3 and table.shape[1] > wanted[1]
         if table is None or (longer and table.shape[::2] == wanted[::2]):
@@ -333,11 +345,17 @@ def _checked(tensors: Tensors, preset: Preset, file: Path) -> Tensors:
     if unknown := [name for name in tensors if name not in expected]:
         complaints.append(f"it has in excess {_listed(unknown)}")
     if misshapen := [
-        f"{name} {tuple(tensors[name].shape)} instead of {shape}"
-        for name, shape in expected.items()
-        if name in tensors and tuple(tensors[name].shape) != shape
+        f"{name} {tuple(tensors[name].shape)} instead of {tuple(like.shape)}"
+        for name, like in expected.items()
+        if name in tensors and tensors[name].shape != like.shape
     ]:
         complaints.append(f"it has in another shape {_listed(misshapen)}")
+    if mistyped := [
+        f"{name} {tensors[name].dtype}"
+        for name, like in expected.items()
+        if name in tensors and not _can_stand_for(tensors[name], like)
+    ]:
+        complaints.append(f"it has as no plain numbers {_listed(mistyped)}")
     if not complaints and (
         broken := [name for name, tensor in tensors.items() if not tensor.float().sum().isfinite()]
     ):
@@ -346,6 +364,12 @@ def _checked(tensors: Tensors, preset: Preset, file: Path) -> Tensors:
         text = f"The weights file '{file}' does not fit the '{preset.name}' network: {'; '.join(complaints)}."
         raise NetworkFileError(text)
     return tensors
+
+
+def _can_stand_for(tensor: torch.Tensor, like: torch.Tensor) -> bool:
+    """Whether it holds real numbers, each of them, with fractions where those are expected."""
+    held = tensor.layout == torch.strided and not (tensor.is_meta or tensor.is_quantized)
+    return held and not tensor.is_complex() and (tensor.is_floating_point() or not like.is_floating_point())
 
 
 def _listed(names: Iterable[str]) -> str:

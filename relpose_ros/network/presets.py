@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args, get_origin, get_type_hints
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,13 @@ class Preset:
     """A distribution over each pair's rotation, or one rotation a view, as six numbers (Zhou et al. 2019)."""
     translation_frame: Literal["look_at", "first_camera"] = "look_at"
     """Origin of the world in which translations are predicted."""
+
+    def __post_init__(self) -> None:
+        for field, kind in get_type_hints(Preset).items():
+            value = getattr(self, field)
+            if get_origin(kind) is Literal and value not in get_args(kind):
+                known = ", ".join(get_args(kind))
+                raise ValueError(f"There is no {field} '{value}' of networks; there are {known}.")
 
     @property
     def crop_width(self) -> int:

@@ -110,6 +110,41 @@ def test_nothing_else_is_forgiven_and_the_names_are_listed(compact: RelPose, tmp
     )
 
 
+@pytest.mark.parametrize(
+    "bias",
+    [
+        torch.zeros(128, dtype=torch.int64),
+        torch.zeros(128, dtype=torch.bool),
+        torch.zeros(128, dtype=torch.complex64),
+        torch.zeros(128, device="meta"),
+        torch.ones(128).to_sparse(),
+    ],
+    ids=lambda bias: f"{bias.dtype} {bias.layout} {bias.device}",
+)
+def test_weights_that_are_no_plain_numbers_are_refused_by_name(
+    compact: RelPose, tmp_path: Path, bias: torch.Tensor
+) -> None:
+    file = released_file(compact, tmp_path / "ckpt.pth", layers__1__bias=bias)
+    assert "no plain numbers layers.1.bias" in refusal(file)
+
+
+def test_a_name_with_and_without_prefix_is_refused(compact: RelPose, tmp_path: Path) -> None:
+    state = {f"module.{name}": tensor for name, tensor in compact.state_dict().items()}
+    torch.save({"state_dict": {**state, "layers.1.bias": torch.zeros(128)}}, tmp_path / "ckpt.pth")
+    assert "the name layers.1.bias;" in refusal(tmp_path / "ckpt.pth")
+
+
+def test_an_archive_that_cannot_be_listed_is_not_opened(
+    compact: RelPose, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = released_file(compact, tmp_path / "ckpt.pth")
+    file.write_bytes(file.read_bytes()[:-30])
+    opened: list[object] = []
+    monkeypatch.setattr(torch, "load", lambda *given, **options: opened.append(given) or {})
+    assert "damaged or truncated archive" in refusal(file)
+    assert opened == []
+
+
 def test_other_metadata_is_kept_through_writing_and_conversion(saved: Path, tmp_path: Path) -> None:
     calibration = json.dumps({"temperature": 1.7, "note": "säfe"})
     network = checkpoint.load_network(saved)
@@ -255,7 +290,11 @@ def test_foreign_files_are_called_by_their_name(tmp_path: Path) -> None:
 def test_a_network_from_the_future_is_refused(saved: Path, compact: RelPose) -> None:
     import safetensors.torch
 
-    for changes in ('{"wavelets": 3}', "[", "3", '{"correlation": {"stage": 1}}', '{"correlation": 5}'):
+    for changes in (
+        *('{"wavelets": 3}', "[", "3", '{"correlation": {"stage": 1}}', '{"correlation": 5}'),
+        *('{"stem_width": -5}', '{"heads": "x"}', '{"stage_widths": [16, 32]}', '{"layers": null}'),
+        *('{"rotation": "spin"}', '{"block": 3}', '{"translation_frame": "lookat"}', '{"image_size": 1.5}'),
+    ):
         metadata = {"preset": "compact", "preset_changes": changes}
         safetensors.torch.save_file(compact.state_dict(), saved, metadata)
         assert "a network unknown here" in refusal(saved)
