@@ -54,8 +54,8 @@ def crop_view(
         (3, S, S) float32, normalised; and (3,) float32, see `crop_parameters`.
 
     Raises:
-        CropError: The box is empty, not finite, far too large, or beside the picture; or the mask has another
-            size than the picture.
+        CropError: The box is empty, not finite, far too large, or beside the picture; the picture is no 8-bit
+            RGB; or the mask is not boolean or has another size than the picture.
     """
     left, top, side = crop_square(view.box, scale, shift)
     if side > MAX_CROP_RATIO * max(view.full_width, view.full_height):
@@ -102,7 +102,13 @@ def crop_parameters(left: int, top: int, side: int, full_width: int, full_height
 
 def _cut(view: View, left: int, top: int, side: int) -> PixelArray:
     """(side, side, 3) pixels of the full image from (left, top) on, as far as the picture has them."""
+    if view.image.dtype != np.uint8 or view.image.shape[2:] != (3,):
+        raise CropError(
+            f"The picture is {view.image.dtype} of shape {view.image.shape}; it must be 8-bit RGB (H, W, 3)."
+        )
     height, width = view.image.shape[:2]
+    if view.mask is not None and view.mask.dtype != np.bool_:
+        raise CropError(f"The mask is {view.mask.dtype}; it must be boolean, True on the object.")
     if view.mask is not None and view.mask.shape != (height, width):
         raise CropError(
             f"The mask is {view.mask.shape[1]} x {view.mask.shape[0]}, its picture {width} x {height}; "

@@ -172,3 +172,22 @@ def test_a_mask_of_another_size_is_refused() -> None:
     masked = replace(view(BoundingBox(0, 0, 50, 50)), mask=np.ones((10, 20), bool))
     with pytest.raises(crops.CropError, match="mask is 20 x 10, its picture 200 x 150"):
         crops.crop_view(masked, SMALL)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_a_mask_of_other_than_truth_values_is_refused(dtype: type) -> None:
+    """Numbers would be taken for rows of pixels, and other pixels than the background painted."""
+    masked = replace(view(BoundingBox(0, 0, 50, 50)), mask=np.ones((150, 200), dtype))
+    with pytest.raises(crops.CropError, match=f"mask is {np.dtype(dtype)}; it must be boolean"):
+        crops.crop_view(masked, SMALL)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [np.ones((150, 200, 3), np.float32), np.ones((150, 200, 4), np.uint8), np.ones((150, 200), np.uint8)],
+    ids=["fractions", "with alpha", "grey"],
+)
+def test_a_picture_that_is_no_8_bit_rgb_is_refused(image: np.ndarray) -> None:
+    """Fractions of 1 would all be cut down to black."""
+    with pytest.raises(crops.CropError, match=f"picture is {image.dtype} of shape .*8-bit RGB"):
+        crops.crop_view(replace(view(BoundingBox(0, 0, 50, 50)), image=image), SMALL)
