@@ -354,7 +354,7 @@ class _Queue:
 
     def follow_clock(self, stamp_ns: int, backward_jump_ns: int) -> None:
         """Forget what lies in the future once two messages in order agree that time jumped back."""
-        if stamp_ns >= self._newest_ns - backward_jump_ns:
+        if stamp_ns > self._newest_ns - backward_jump_ns:
             self._newest_ns = max(self._newest_ns, stamp_ns)
             self._suspect_ns = None
         elif self._suspect_ns is None or stamp_ns <= self._suspect_ns:

@@ -92,9 +92,10 @@ class ScanBuffer:
         Saves decoding it.
         """
         newest_ns = self._newest_ns()
-        if self._jumps_back(stamp_ns, topic) or newest_ns is None:
+        jumps = self._jumps_back(stamp_ns, topic) or self._confirms_jump(stamp_ns, topic)
+        if jumps or newest_ns is None:
             return None
-        if stamp_ns in self._seen or any(view.stamp_ns == stamp_ns for view in self._all()):
+        if self._was_seen(stamp_ns):
             return Decision(False, "a view with this stamp was seen already")
         if stamp_ns <= newest_ns:
             late = f"it is {(newest_ns - stamp_ns) / 1e9:.3f} s older than the scan of {self.object_id!r}"
@@ -110,22 +111,21 @@ class ScanBuffer:
         """Take a view, or say why not.
 
         A stamp far behind the last one on its topic is a garbage stamp or a clock that jumped backwards. The
-        next message on the topic tells which: if it is behind as well and in order, time did jump.
+        next message on the topic tells which: if it is behind as well and in order, time did jump; or if both
+        repeat what was seen before, as in a bag too short for two messages far behind.
         """
         declined = self.declines(view.stamp_ns, topic)
         if declined is not None:
             return declined
-        if self._jumps_back(view.stamp_ns, topic):
-            suspect = self._suspects.get(topic)
-            if suspect is None or view.stamp_ns <= suspect.stamp_ns:
-                self._suspects[topic] = view
-                behind = (self._newest_on[topic] - view.stamp_ns) / 1e9
-                text = (
-                    f"it is {behind:.3f} s older than the last one on this topic: rejected unless the next "
-                )
-                return Decision(False, text + "one confirms that time jumped backwards", rejected=True)
-            self._follow_jump(suspect)
-            self._take(suspect, topic)
+        if self._confirms_jump(view.stamp_ns, topic):
+            first = self._suspects[topic]
+            self._follow_jump(first)
+            self._take(first, topic)
+        elif self._jumps_back(view.stamp_ns, topic):
+            self._suspects[topic] = view
+            behind = (self._newest_on[topic] - view.stamp_ns) / 1e9
+            text = f"it is {behind:.3f} s older than the last one on this topic: rejected unless the next "
+            return Decision(False, text + "one confirms that time jumped backwards", rejected=True)
         return self._take(view, topic)
 
     def work(self) -> Work | None:
@@ -250,13 +250,23 @@ class ScanBuffer:
     def _jumps_back(self, stamp_ns: int, topic: str) -> bool:
         # Each topic's own clock: another one may lag behind by more than any jump.
         newest_ns = self._newest_on.get(topic)
-        return newest_ns is not None and stamp_ns < newest_ns - self._backward_jump_ns
+        return newest_ns is not None and stamp_ns <= newest_ns - self._backward_jump_ns
+
+    def _confirms_jump(self, stamp_ns: int, topic: str) -> bool:
+        suspect = self._suspects.get(topic)
+        if suspect is None or stamp_ns <= suspect.stamp_ns:
+            return False
+        repeats = self._was_seen(suspect.stamp_ns) and self._was_seen(stamp_ns)
+        return repeats or self._jumps_back(stamp_ns, topic)
+
+    def _was_seen(self, stamp_ns: int) -> bool:
+        return stamp_ns in self._seen or any(view.stamp_ns == stamp_ns for view in self._all())
 
     def _follow_jump(self, first: View) -> None:
         """Forget what lies after the first view of the time that counts from now on."""
         views = self._all()
         ahead = [view for view in views if view.stamp_ns > first.stamp_ns]
-        repeated = any(view.stamp_ns == first.stamp_ns for view in views)
+        repeated = self._was_seen(first.stamp_ns)
         if len(ahead) == 1 and len(views) > 1 and not repeated:
             text = "The view of %r with stamp %s is dropped: two later messages are older than that."
             _logger.warning(text, self.object_id, stamp_text(ahead[0].stamp_ns))

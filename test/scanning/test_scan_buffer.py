@@ -226,9 +226,22 @@ def test_a_bag_that_loops_starts_the_scan_anew(
     assert caplog.text == ""
     add(buffer, *stamps)
     assert stamps_of(buffer) == expected
-    if count > 2:  # with two, the second message repeats the newest view: nothing tells it from a late copy
-        assert f"Time jumped backwards from {buffer_text(stamps, keep)} to 10.000000000" in caplog.text
-        assert "the scan of 'mug' starts anew" in caplog.text
+    assert f"Time jumped backwards from {buffer_text(stamps, keep)} to 10.000000000" in caplog.text
+    assert "the scan of 'mug' starts anew" in caplog.text
+
+
+def test_a_short_bag_that_loops_starts_the_scan_anew_at_every_round(caplog: pytest.LogCaptureFixture) -> None:
+    buffer = buffer_with(1, 2)
+    for _ in range(3):
+        assert [each.accepted for each in add(buffer, 1, 2)] == [False, True]
+        assert stamps_of(buffer) == [1, 2]
+    assert caplog.text.count("Time jumped backwards from 2.000000000 to 1.000000000") == 3
+
+
+def test_late_copies_are_no_jump() -> None:
+    buffer = buffer_with(1, 2, 3, 4)
+    assert [each.accepted for each in add(buffer, 1, 5, 2, 6)] == [False, True, False, True]
+    assert stamps_of(buffer) == [1, 2, 3, 4, 5, 6]
 
 
 def buffer_text(stamps: list[float], keep: str) -> str:

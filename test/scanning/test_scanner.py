@@ -170,9 +170,9 @@ def test_a_view_the_scan_cannot_want_is_not_decoded(
     bag_messages: Any, circle_estimator: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scanner = Scanner(circle_estimator(), ScanSettings(keep="first", max_views=2))
-    send_views(scanner, bag_messages, 1, 2)
+    send_views(scanner, bag_messages, 1, 1.5)
     monkeypatch.setattr("relpose_ros.scanning.image_decoding.decode_image", None)
-    assert not any(receipt.rejected for receipt in send_views(scanner, bag_messages, 1, 2, 3))
+    assert not any(receipt.rejected for receipt in send_views(scanner, bag_messages, 1, 1.5, 3))
 
 
 def test_statistics_tell_the_state_of_each_scan(messages: Any, circle_estimator: Callable[..., Any]) -> None:
