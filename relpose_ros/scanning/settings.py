@@ -179,7 +179,9 @@ class ScanSettings:
                 f"{path} holds no parameters of the scan node: start it with '/**:' and 'ros__parameters:'."
             )
             raise SettingsError(text)
-        own = {name: value for name, value in values.items() if name not in {"use_sim_time", "qos_overrides"}}
+        # ROS takes a dotted name as well as nested ones: qos_overrides./image.subscription.depth.
+        foreign = {"use_sim_time", "qos_overrides"}
+        own = {name: each for name, each in values.items() if str(name).partition(".")[0] not in foreign}
         return cls.from_mapping(own)
 
 

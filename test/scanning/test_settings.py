@@ -67,6 +67,7 @@ def test_a_parameter_file_may_hold_several_nodes(tmp_path: Path) -> None:
     path.write_text(
         "/**:\n  ros__parameters: {max_views: 3, use_sim_time: true}\n"
         "camera:\n  ros__parameters: {exposure: 1}\n"
+        "/scan_node:\n  ros__parameters: {qos_overrides./image.subscription.depth: 9}\n"
         "scan_node:\n  ros__parameters: {max_views: 4}\n"
     )
     assert ScanSettings.from_yaml(path) == ScanSettings(max_views=4)
