@@ -295,6 +295,7 @@ class BagWriter:
         """
         if path.exists():
             raise BagError(f"{path} exists already; name another bag or remove it first.")
+        self._path = path
         self._typestore = _base_store()
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Connection] = {}
@@ -302,8 +303,15 @@ class BagWriter:
         """Message classes by name, to be filled and written."""
 
     def __enter__(self) -> Self:
-        """Create the folder."""
-        self._writer.open()
+        """Create the folder.
+
+        Raises:
+            BagError: The file system refuses.
+        """
+        try:
+            self._writer.open()
+        except OSError as err:
+            raise BagError(f"{self._path} cannot be created: {err.strerror}.") from err
         return self
 
     def __exit__(

@@ -92,6 +92,7 @@ def replay(
     with BagReader(bag) as reader:
         inputs = choose_inputs(reader, topics)
         truth = _ground_truth(reader)
+        _check_writable(output)  # before the long part
         if estimator is None:
             estimator = _learned_estimator(weights, settings)
         scanner = Scanner(estimator, settings)
@@ -320,6 +321,8 @@ def _lines(values: Sequence[Any]) -> str:
 
 def _check_replaceable(output: Path) -> None:
     """Refuse an output that holds anything but an earlier replay's files."""
+    if output.name in ("", ".."):
+        raise ReplayError(f"{output} cannot be replaced as a whole; name a folder for the output.")
     if not output.exists():
         return
     if not output.is_dir():
@@ -328,6 +331,16 @@ def _check_replaceable(output: Path) -> None:
     if foreign is not None:
         text = f"{output} holds {foreign}, which no replay wrote; name another folder or move it away."
         raise ReplayError(text)
+
+
+def _check_writable(output: Path) -> None:
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=output.parent):
+            pass
+    except OSError as err:
+        text = f"{output} cannot be written: {err.strerror}; name another folder for the output."
+        raise ReplayError(text) from err
 
 
 def _foreign(folder: Path, depth: int = 0) -> str | None:
@@ -347,7 +360,6 @@ def _foreign(folder: Path, depth: int = 0) -> str | None:
 @contextmanager
 def _written_whole(output: Path) -> Iterator[Path]:
     """A folder that takes the output's place when it is complete: a replay that fails leaves the old one."""
-    output.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=output.parent, prefix=f".{output.name}-") as temporary:
         folder = Path(temporary) / "new"
         folder.mkdir()

@@ -270,6 +270,9 @@ def test_what_is_written_carries_its_definitions(tmp_path: Path) -> None:
 
 
 def test_a_bag_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(BagError, match="cannot be created"), BagWriter(tmp_path / "file/bag"):
+        pass
     with pytest.raises(BagError, match="exists already"):
         BagWriter(tmp_path)
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from relpose_ros.scanning.settings import ScanSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
-    from pathlib import Path
 
     from relpose_ros.replay.bags import Record
     from relpose_ros.replay.comparison import TruePose
@@ -275,6 +275,11 @@ def test_only_an_earlier_replay_is_replaced(tmp_path: Path, capture: Capture, fa
     assert (output / "thesis.tex").read_text() == "years of work"
     with pytest.raises(ReplayError, match="is a file"):
         replay(tmp_path / "bag", output / "thesis.tex", estimator=fake_estimator(truth))
+    with pytest.raises(ReplayError, match="cannot be written"):
+        replay(tmp_path / "bag", output / "thesis.tex" / "sub", estimator=fake_estimator(truth))
+    # The shell that replays stands in it, and would stand in a folder that is gone.
+    with pytest.raises(ReplayError, match="cannot be replaced as a whole"):
+        replay(tmp_path / "bag", Path(), estimator=fake_estimator(truth))
     # The bag itself is no output either, although its folder could be named by mistake.
     with pytest.raises(ReplayError, match="which no replay wrote"):
         replay(tmp_path / "bag", tmp_path / "bag", estimator=fake_estimator(truth))
