@@ -39,6 +39,7 @@ from relpose_ros.node.parameters import changed_settings, declare_parameters
 from relpose_ros.node.reports import NodeHealth, Throttle, diagnostic_status, loss_advice, qos_advice
 from relpose_ros.scanning.scanner import Scanner
 from relpose_ros.scanning.settings import SettingsError
+from relpose_ros.views import MIN_VIEWS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -424,6 +425,9 @@ class ScanNode(LifecycleNode):
         scanner = self._scanner_if_active(response)
         if scanner is not None:
             receipt = scanner.drop_last_view()
+            left = scanner.statistics().scans.get(receipt.object_id)
+            if receipt.accepted and (left is None or left.views < MIN_VIEWS):
+                self._submit(self._clear_markers)  # no estimate will take their place
             self._ask_for_estimate()
             response.success, response.message = receipt.accepted, receipt.reason
         return response
@@ -478,6 +482,8 @@ class ScanNode(LifecycleNode):
         self._settings = changed_settings(old, parameters, configured=False)
         if self._scanner is not None and self._settings != old:
             self._scanner.change_settings(self._settings)
+            if self._active:  # fewer views may be left, of which there is no estimate yet
+                self._ask_for_estimate()
         if (old.diagnostics, old.diagnostics_period_s) != (
             self._settings.diagnostics,
             self._settings.diagnostics_period_s,

@@ -172,11 +172,23 @@ def test_services(node: Any, graph: Any, make: Any) -> None:
     answer = graph.trigger("estimate_now")
     assert answer.success
     assert answer.message == f"mug: {graph.estimate_of('mug', views=2).status}"
-    graph.markers.clear()
-    answer = graph.trigger("reset")
-    assert (answer.success, answer.message) == (True, "2 views forgotten.")
-    graph.wait_until(lambda: graph.markers, "markers that clear the screen")
-    assert [each.action for each in graph.markers[0].markers] == [Marker.DELETEALL]
+    for service, message in (("drop_last_view", "is dropped."), ("reset", "1 views forgotten.")):
+        graph.markers.clear()
+        answer = graph.trigger(service)
+        assert answer.success
+        assert answer.message.endswith(message)
+        graph.wait_until(lambda: graph.markers, "markers that clear the screen")
+        assert [each.action for each in graph.markers[0].markers] == [Marker.DELETEALL]
+
+
+def test_views_that_other_parameters_leave_are_estimated_at_once(node: Any, graph: Any, make: Any) -> None:
+    graph.publish(OBJECT_VIEW, *(make.object_view(10.0 + k, "mug") for k in range(3)))
+    graph.estimate_of("mug", views=3)
+    assert graph.set_parameter("max_views", 2) == (True, "")
+    try:
+        graph.estimate_of("mug", views=2)
+    finally:
+        assert graph.set_parameter("max_views", 8) == (True, "")
 
 
 def test_parameters_are_described_and_judged(node: Any, graph: Any) -> None:
