@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class AscentSettings:
     """How the joint maximum is looked for."""
 
-    beam: int = 24
+    beam: int = 12
     """Partial solutions kept while cameras join."""
     effort: int = 84
     """Pairs times climbers: three climbers with 8 views, and more where a climber costs less."""
@@ -34,11 +34,13 @@ class AscentSettings:
     climb_stride: float = math.radians(8)
     """First step of a joint climb, rad."""
     climb_steps: int = 16
-    jumps: int = 2
+    jumps: int = 1
     """Sweeps in which a camera may leave for any mode of its pairs."""
-    content: float = 1.0
-    """A camera stays when its pairs are on average this near to their highest modes, in nats: even the best
-    place could gain no more. This is what makes scans cheap whose pairs agree."""
+    content: float = 1.5
+    """Nats a pair. Where the pairs of a scan, or of a camera, are on average this near to their highest
+    modes, no other place is looked for: the best could gain no more. Scans whose pairs agree become cheap."""
+    reach: float = 0.5
+    """Nats a pair: a solution further below the best one is told as it is, and not refined."""
     hops: int = 4
     """Places considered for a camera in such a sweep: so many modes, and so many cells of the coarse grid."""
     hop_steps: int = 6
@@ -67,7 +69,7 @@ class JointSolutions:
 
 def joint_scores(energies: PairEnergies, rotations: torch.Tensor) -> torch.Tensor:
     """Sum over pairs of the energy of ``R_j R_i^T``. (S, N, 3, 3) -> (S,) float64; differentiable."""
-    relative = rotations[:, energies.j] @ rotations[:, energies.i].transpose(-1, -2)  # (S, P, 3, 3)
+    relative = rotations[:, energies.j] @ rotations[:, energies.i].mT  # (S, P, 3, 3)
     values = energies.at(torch.arange(energies.count), relative.transpose(0, 1))
     return values.double().sum(0)
 
@@ -77,24 +79,38 @@ def solve(
 ) -> JointSolutions:
     """The joint maximum and the other local maxima that were met on the way."""
     climbers = settings.climbers(energies.count)
-    roots = range(min(climbers, energies.views))
-    rotations = torch.cat([_grow(energies, distributions, root, settings) for root in roots])
-    rotations, _ = _best(energies, rotations, 2 * climbers, settings.distinct)
-    rotations = _climb(energies, rotations, settings.climb_stride, settings.climb_steps)
-    starts, _ = _best(energies, rotations, 2 * climbers, settings.distinct)
-    rotations = starts[:climbers]
-    for _ in range(settings.jumps):
-        rotations = _jump(energies, distributions, rotations, settings)
+    starts, scores = _starts(energies, distributions, 0, settings)
+    finalists = starts[:climbers]
+    if distributions.mode_energies[:, 0].sum() - scores[0] > settings.content * energies.count:
+        more = [
+            _starts(energies, distributions, root, settings)[0]
+            for root in range(1, min(climbers, energies.views))
+        ]
+        starts, _ = _best(energies, torch.cat([starts, *more]), 2 * climbers, settings.distinct)
+        finalists = starts[:climbers]
+        for _ in range(settings.jumps):
+            finalists = _jump(energies, distributions, finalists, settings)
+        finalists, scores = _best(energies, torch.cat([finalists, starts]), climbers, settings.distinct)
+        finalists = finalists[scores > scores[0] - settings.reach * energies.count]
+        for radius in settings.radii:
+            finalists = _sweep(energies, finalists, radius)
     # Jumps may all end on one hill: where they started is kept beside, for a runner-up to be told.
-    rotations, _ = _best(energies, torch.cat([rotations, starts]), climbers, settings.distinct)
-    for radius in settings.radii:
-        rotations = _sweep(energies, rotations, radius)
-    rotations, scores = _best(energies, torch.cat([rotations, starts]), climbers, settings.distinct)
+    rotations, _ = _best(energies, torch.cat([finalists, starts]), climbers, settings.distinct)
     winner = rotations[:1]
     for radius in settings.last_radii:
         winner = _sweep(energies, winner, radius)
     rotations, scores = _best(energies, torch.cat([winner, rotations[1:]]), climbers, settings.distinct)
     return JointSolutions(rotations, scores)
+
+
+def _starts(
+    energies: PairEnergies, distributions: PairDistributions, root: int, settings: AscentSettings
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The ends of one beam, climbed; best first. -> (S, N, 3, 3), (S,)."""
+    count = 2 * settings.climbers(energies.count)
+    rotations, _ = _best(energies, _grow(energies, distributions, root, settings), count, settings.distinct)
+    rotations = _climb(energies, rotations, settings.climb_stride, settings.climb_steps)
+    return _best(energies, rotations, count, settings.distinct)
 
 
 def _best(
@@ -159,7 +175,7 @@ def _mode_candidates(
     for other in others:
         pair = int(energies.pair_of[camera, other])
         modes = distributions.modes[pair][distributions.mode_energies[pair] > -math.inf]
-        camera_from_other = modes if camera > other else modes.transpose(-1, -2)
+        camera_from_other = modes if camera > other else modes.mT
         parts.append(camera_from_other @ rotations[:, other, None])
     return torch.cat(parts, 1)
 
@@ -173,9 +189,9 @@ def _conditional(
     """
     pairs = energies.pair_of[camera, others]
     placed = rotations[:, others].transpose(0, 1)[:, :, None]  # (O, S, 1, 3, 3)
-    relative = candidates @ placed.transpose(-1, -2)  # (O, S, C, 3, 3): camera from other
+    relative = candidates @ placed.mT  # (O, S, C, 3, 3): camera from other
     forward = torch.tensor([camera > other for other in others])[:, None, None, None, None]
-    relative = torch.where(forward, relative, relative.transpose(-1, -2))
+    relative = torch.where(forward, relative, relative.mT)
     return energies.at(pairs, relative.flatten(1, 2)).double().sum(0).view(candidates.shape[:2])
 
 

@@ -112,14 +112,11 @@ class PairEnergies:
 
     def on_cells(self, grid: GridEmbeddings, level: int, cells: torch.Tensor) -> torch.Tensor:
         """Energies of every pair at its own cells of a level. (P, C) int64 -> (P, C)."""
-        energies = torch.empty(cells.shape, dtype=self.contexts.dtype)
-        for pair in range(self.count):
-            for start in range(0, cells.shape[1], ROWS):
-                part = slice(start, start + ROWS)
-                energies[pair, part] = self.model.pair_energies(
-                    self.contexts[pair : pair + 1], grid.of_cells(level, cells[pair, part])
-                )[0]
-        return energies
+        parts = [
+            self.model.pair_energies(self.contexts[part], grid.of_cells(level, cells[part]))
+            for part in _blocks(*cells.shape)
+        ]
+        return torch.cat(parts)
 
     def at(self, pairs: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
         """Energies at any rotations; differentiable. (Q,) int64 pairs, (Q, K, 3, 3) -> (Q, K)."""
