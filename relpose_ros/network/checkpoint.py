@@ -122,7 +122,10 @@ def write_network(
     beside = target.with_name(target.name + ".partial")
     safetensors = _safetensors()
     try:
+        beside.touch()
+        mode = beside.stat().st_mode
         safetensors.torch.save_file(state, beside, metadata=written)
+        beside.chmod(mode)  # safetensors leaves a file that its owner alone may read
         beside.replace(target)
     except (OSError, safetensors.SafetensorError) as err:
         beside.unlink(missing_ok=True)
@@ -165,6 +168,10 @@ def digest(tensors: Tensors) -> str:
 def _existing(path: Path | str | None) -> Path:
     file = SHIPPED_WEIGHTS if path is None else Path(path)
     if file.is_file():
+        try:
+            file.open("rb").close()
+        except OSError as err:
+            raise NetworkFileError(f"The weights file '{file}' cannot be read: {err.strerror}.") from err
         return file
     if path is None:
         raise NetworkFileError(f"No weights are installed at '{file}'; name a file with --weights.")

@@ -14,6 +14,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from relpose_ros import cli
 from relpose_ros.network import checkpoint
 from relpose_ros.network.checkpoint import NetworkFileError
 from relpose_ros.network.presets import PRESETS
@@ -182,6 +183,26 @@ def test_half_precision_is_half_as_large_and_close(compact: RelPose, saved: Path
     assert next(loaded.parameters()).dtype == torch.float32
     for ours, theirs in zip(loaded.parameters(), compact.parameters(), strict=True):
         assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-6)
+
+
+def test_whoever_may_read_new_files_may_read_written_weights(saved: Path, tmp_path: Path) -> None:
+    plain = tmp_path / "plain"
+    plain.touch()
+    assert saved.stat().st_mode == plain.stat().st_mode
+
+
+def test_a_file_that_may_not_be_read_is_refused(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*given: object, **options: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("pathlib.Path.open", forbidden)
+    assert "cannot be read: Permission denied" in refusal(saved)
+
+
+def test_the_command_converts(compact: RelPose, tmp_path: Path) -> None:
+    source, target = released_file(compact, tmp_path / "ckpt.pth"), tmp_path / "weights.safetensors"
+    assert cli.main(["convert", str(source), "--output", str(target)]) == 0
+    assert same_weights(checkpoint.load_network(target), compact)
 
 
 def test_loaded_weights_do_not_hang_on_the_file(saved: Path, compact: RelPose) -> None:
