@@ -44,19 +44,20 @@ HEADER = (
     f"{'one view more, s':>17}  {'published, s':>13}  {'times':>6}  peak, MiB"
 )
 SEARCHES = [
-    SearchSettings(level=level, widths=widths)
+    SearchSettings(level=level, widths=widths, widest=1)
     for level, widths in [
         (1, ()),
-        (1, (16,)),
         (1, (64,)),
         (1, (8, 8)),
-        (1, (32, 32)),
         (1, (64, 64)),
         (1, (128, 128)),
-        (1, (16, 16, 16)),
-        (1, (32, 32, 32)),
+        (1, (8, 8, 8)),
         (1, (64, 64, 64)),
+        (1, (8, 8, 8, 8)),
+        (1, (64, 24, 8, 8)),
         (1, (32, 32, 32, 32)),
+        (1, (64, 64, 64, 64)),
+        (1, (512, 192, 64, 64)),
         (2, ()),
         (2, (64,)),
         (2, (256,)),

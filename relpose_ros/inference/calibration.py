@@ -51,7 +51,7 @@ class Calibration:
     """Energies are divided by it."""
     pair_spread: float = 1.0
     """Factor on the covariance of a pair's relative rotation."""
-    camera_spread: float = 1.0
+    rotation_spread: float = 1.0
     """Factor on the covariance of a camera's rotation."""
     translation_sigma: tuple[float, float, float] = (0.1, 0.1, 0.2)
     """Standard deviation of a predicted translation in the camera's axes, in units of the first camera's
@@ -210,7 +210,11 @@ def _mahalanobis_squares(
             of_pairs.append(_square(so3.log(truth @ pair.camera_j_from_camera_i.T), pair.covariance))
         with torch.no_grad():
             covariances = camera_covariances(
-                observation.energies, observation.solutions, observation.translations, calibration
+                observation.distributions,
+                observation.energies,
+                observation.solutions.rotations[0],
+                observation.translations,
+                calibration,
             )
         rotations = observation.solutions.rotations[0].numpy()
         centres = cameras.camera_centre(rotations, observation.translations)

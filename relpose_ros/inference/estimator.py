@@ -100,10 +100,11 @@ class Estimator:
             translations = self._network.optical_translations(features).double().numpy()
             unit = max(float(np.linalg.norm(translations[0])), 1e-6)
             translations = translations / unit
-            rotations = solutions.rotations[0].numpy()
+            solution = solutions.rotations[0]
+            rotations = solution.numpy()
             centres = cameras.camera_centre(rotations, translations)
-            covariances = camera_covariances(energies, solutions, translations, calibration)
-            pairs = describe_pairs(distributions, energies, solutions.rotations[0], calibration)
+            covariances = camera_covariances(distributions, energies, solution, translations, calibration)
+            pairs = describe_pairs(distributions, energies, solution, calibration)
             verdict, weakest, status = judge(pairs, covariances, self._calibration is not None)
             return ScanEstimate(
                 object_id=scan.object_id,

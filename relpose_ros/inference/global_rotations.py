@@ -225,7 +225,7 @@ def _neighbourhood() -> torch.Tensor:
     return torch.cat([torch.zeros(1, 3, dtype=torch.float64), edge, axes])
 
 
-NEIGHBOURHOOD = _neighbourhood()
+_NEIGHBOURHOOD = _neighbourhood()
 
 
 def _jump(
@@ -311,7 +311,7 @@ def _coarse_conditional(
 def _sweep(energies: PairEnergies, rotations: torch.Tensor, radius: float) -> torch.Tensor:
     """Moves every camera in turn to the best place around it. (S, N, 3, 3) -> (S, N, 3, 3)."""
     rotations = rotations.clone()
-    offsets = so3.exp_tensor(NEIGHBOURHOOD * radius)  # the first is the identity: no camera gets worse
+    offsets = so3.exp_tensor(_NEIGHBOURHOOD * radius)  # the first is the identity: no camera gets worse
     rows = torch.arange(len(rotations))
     for camera in range(energies.views):
         others = [other for other in range(energies.views) if other != camera]

@@ -30,6 +30,10 @@ class SearchSettings:
     """The level evaluated in full: 72 * 8^level cells a pair, 30 degrees apart at level 1."""
     widths: tuple[int, ...] = (64, 24, 8, 8)
     """Cells split at that level and at each one below it: cells of 2 degrees at the end."""
+    full_scan: int = 28
+    """The widths are meant for so many pairs. Fewer pairs are searched as much wider, up to `widest` times:
+    two views then cost what eight do, and are searched nearly densely."""
+    widest: int = 8
     modes: int = 8
     """Modes looked for a pair."""
     separation: float = math.radians(25)
@@ -83,7 +87,8 @@ def search(
     coarse = values.double()
     ancestors = cells
     kept: list[tuple[int, torch.Tensor, torch.Tensor]] = []
-    for width in settings.widths:
+    wider = min(settings.widest, max(1.0, settings.full_scan / energies.count))
+    for width in (min(round(wider * width), so3_grid.size(settings.level)) for width in settings.widths):
         values, order = torch.sort(values, dim=1, descending=True, stable=True)
         cells, ancestors = torch.gather(cells, 1, order), torch.gather(ancestors, 1, order)
         kept.append((level, cells[:, width:], values[:, width:]))

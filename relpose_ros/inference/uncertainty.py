@@ -10,13 +10,11 @@ import torch
 
 from relpose_ros.estimates import Evidence, Mode, PairRotation
 from relpose_ros.geometry import so3
-from relpose_ros.inference.global_rotations import NEIGHBOURHOOD
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from relpose_ros.inference.calibration import Calibration
-    from relpose_ros.inference.global_rotations import JointSolutions
     from relpose_ros.inference.pair_distribution import PairDistributions
     from relpose_ros.inference.pair_energies import PairEnergies
 
@@ -33,10 +31,6 @@ RUNNER_UP_WEIGHT = 0.15
 """A second mode matters from here on: about one chance in seven of being the true one."""
 FLOOR = math.radians(0.1)
 """The solver's own accuracy, rad: the standard deviation stated for what the gauge fixes by definition."""
-UNIFORM_VARIANCE = (math.pi**2 / 3 + 2) / 3
-"""Per axis, rad^2, of the rotation vector of a uniformly random rotation: the most that can be unknown."""
-CURVATURE_RADIUS = math.radians(6)
-"""Neighbourhood over which an energy's curvature is measured: above the ripples, below a mode's width."""
 
 
 def describe_pairs(
@@ -126,95 +120,75 @@ def _second_moment(
     used = mass > 1e-9 * mass.max()  # logarithms of the rest would be most of the work for nothing
     share = (mass[used] / mass[used].sum()).numpy()
     vectors = so3.log((distributions.rotations[pair][used] @ centre.T).numpy())
-    inside_cells = float((distributions.spacings[used].numpy() ** 2 * share).sum()) / 12
-    return np.asarray(np.einsum("l,la,lb->ab", share, vectors, vectors) + inside_cells * np.eye(3))
+    finest = (
+        float(distributions.spacings.min()) ** 2 / 12
+    )  # a peak inside one cell is not sharper than the cell
+    return np.asarray(np.einsum("l,la,lb->ab", share, vectors, vectors) + finest * np.eye(3))
 
 
 def camera_covariances(
+    distributions: PairDistributions,
     energies: PairEnergies,
-    solutions: JointSolutions,
+    solution: torch.Tensor,
     translations: FloatArray,
     calibration: Calibration,
 ) -> FloatArray:
     """Covariance of every camera in the object frame, as geometry_msgs/PoseWithCovariance orders it.
 
-    The rotations' part is the inverse of the joint energy's curvature at the best solution, plus the spread
-    over the other solutions, each by its probability. Every view takes part in N - 1 pairs, whose errors are
-    therefore not N - 1 independent ones: the joint energy is divided by N / 2, which is exact where each
-    view has one error of its own.
+    Each pair is taken as the Gaussian with its second moment about the final poses' relative rotation. For a
+    pair with one sharp peak there, this is its energy's curvature; a pair with other modes, or one that
+    disagrees, holds its cameras the less. Curvature alone would call an ambiguous pair certain.
 
     Args:
-        energies: of the scan.
-        solutions: joint maxima, best first.
+        distributions: of the P pairs.
+        energies: which views a pair is of.
+        solution: (N, 3, 3) float64 camera_from_object.
         translations: (N, 3) camera_from_object, in units of the first camera's distance.
         calibration: of the network.
 
     Returns:
         (N, 6, 6): x, y, z, rotation about X, Y, Z, fixed axes of the object frame.
     """
-    temperature = calibration.temperature * energies.views / 2
-    best = solutions.rotations[0]
-    information = _joint_information(energies, best, temperature)
-    spread = np.linalg.inv(information)
-    offsets = so3.log((solutions.rotations @ best.mT).numpy())  # (S, N, 3), camera axes
-    # What lies nearer is the same hill, and in its curvature already.
-    apart = np.linalg.norm(offsets, axis=2).max(1) > BASIN
-    apart[0] = True
-    offsets = offsets[apart]
-    chances = torch.softmax(solutions.scores[torch.from_numpy(apart)] / temperature, 0).numpy()
-    rotations = best.numpy()
-    sigma = np.array(calibration.translation_sigma)
-    covariances = np.empty((energies.views, 6, 6))
-    for camera in range(energies.views):
-        if camera == 0:
-            rotation_part = FLOOR**2 * np.eye(3)
-            # By definition of the unit of length its distance is one.
-            direction = translations[0] / np.linalg.norm(translations[0])
-            across = np.eye(3) - np.outer(direction, direction)
-            translation_part = across @ np.diag(sigma**2) @ across + FLOOR**2 * np.eye(3)
-        else:
-            block = spread[3 * camera - 3 : 3 * camera, 3 * camera - 3 : 3 * camera]
-            others = np.einsum("s,sa,sb->ab", chances, offsets[:, camera], offsets[:, camera])
-            rotation_part = (block + others) * calibration.camera_spread + FLOOR**2 * np.eye(3)
-            translation_part = np.diag(sigma**2)
-        object_from_camera = rotations[camera].T
+    spread = _joint_spread(distributions, energies, solution, calibration) + FLOOR**2 * np.eye(3)
+    sigma = np.diag(np.square(calibration.translation_sigma))
+    shifts = np.repeat(sigma[None], energies.views, 0)
+    # By definition of the unit of length the first camera's distance is one.
+    direction = translations[0] / np.linalg.norm(translations[0])
+    across = np.eye(3) - np.outer(direction, direction)
+    shifts[0] = across @ sigma @ across + FLOOR**2 * np.eye(3)
+    covariances = np.zeros((energies.views, 6, 6))
+    for camera, object_from_camera in enumerate(solution.mT.numpy()):
         # A turn e of the camera (axes of the camera, left perturbation of camera_from_object) is the turn
         # -R^T e in the object's axes, and moves the centre -R^T t by -R^T (t x e).
         turn = np.concatenate([-object_from_camera @ so3.hat(translations[camera]), -object_from_camera])
-        covariances[camera] = turn @ rotation_part @ turn.T
-        covariances[camera, :3, :3] += object_from_camera @ translation_part @ object_from_camera.T
+        covariances[camera] = turn @ spread[camera] @ turn.T
+        covariances[camera, :3, :3] += object_from_camera @ shifts[camera] @ object_from_camera.T
     return np.asarray((covariances + covariances.transpose(0, 2, 1)) / 2)
 
 
-def _joint_information(energies: PairEnergies, rotations: torch.Tensor, temperature: float) -> FloatArray:
-    """Curvature of the tempered joint energy in the cameras' own axes, the first camera held.
+def _joint_spread(
+    distributions: PairDistributions,
+    energies: PairEnergies,
+    solution: torch.Tensor,
+    calibration: Calibration,
+) -> FloatArray:
+    """Covariance of each camera's turn in its own axes, the first camera held. -> (N, 3, 3) rad^2.
 
-    With R_ij = R_j R_i^T, turns e_i and e_j of the cameras turn R_ij by e_j - R_ij e_i.
-    (N, 3, 3) -> (3 N - 3, 3 N - 3).
+    With R_ij = R_j R_i^T, turns e_i and e_j of the cameras turn R_ij by e_j - R_ij e_i. Every view takes part
+    in N - 1 pairs, whose errors are therefore not N - 1 independent ones: the sum of the pairs' information
+    is divided by N / 2, which is exact where each view has one error of its own.
     """
-    relative = rotations[energies.j] @ rotations[energies.i].mT
-    curvatures = _curvatures(energies, relative) / temperature
-    information = np.eye(3 * energies.views) / UNIFORM_VARIANCE
+    relative = solution[energies.j] @ solution[energies.i].mT
+    masses = distributions.masses(calibration.temperature)
+    information = np.zeros((3 * energies.views, 3 * energies.views))
     for pair, (i, j) in enumerate(zip(energies.i.tolist(), energies.j.tolist(), strict=True)):
+        moment = _second_moment(distributions, pair, relative[pair], masses[pair])
         jacobian = np.zeros((3, 3 * energies.views))
         jacobian[:, 3 * i : 3 * i + 3] = -relative[pair].numpy()
         jacobian[:, 3 * j : 3 * j + 3] = np.eye(3)
-        information += jacobian.T @ curvatures[pair] @ jacobian
-    return information[3:, 3:]
-
-
-def _curvatures(energies: PairEnergies, relative: torch.Tensor) -> FloatArray:
-    """Minus the second derivative of each pair's energy, of a quadratic fitted around; never negative.
-
-    Fitted over a neighbourhood instead of differentiated at a point, because the energies are piecewise
-    linear in places and rippled in others. (P, 3, 3) -> (P, 3, 3).
-    """
-    offsets = NEIGHBOURHOOD * CURVATURE_RADIUS
-    around = so3.exp_tensor(offsets) @ relative[:, None]
-    values = energies.at(torch.arange(energies.count), around).double().numpy()
-    x, y, z = offsets.numpy().T
-    design = np.stack([np.ones_like(x), x, y, z, x * x / 2, y * y / 2, z * z / 2, x * y, x * z, y * z], 1)
-    xx, yy, zz, xy, xz, yz = (values @ np.linalg.pinv(design).T)[:, 4:].T
-    hessian = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
-    sizes, axes = np.linalg.eigh(-hessian)
-    return np.asarray(np.einsum("pab,pb,pcb->pac", axes, np.maximum(sizes, 0), axes))
+        information += jacobian.T @ np.linalg.inv(moment) @ jacobian
+    joint = np.linalg.inv(information[3:, 3:] / (energies.views / 2)) * calibration.rotation_spread
+    spread = np.zeros((energies.views, 3, 3))
+    for camera in range(1, energies.views):
+        spread[camera] = joint[3 * camera - 3 : 3 * camera, 3 * camera - 3 : 3 * camera]
+    return spread

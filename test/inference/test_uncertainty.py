@@ -15,10 +15,11 @@ from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.global_rotations import solve
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
-from relpose_ros.inference.uncertainty import FLOOR, UNIFORM_VARIANCE, camera_covariances, describe_pairs
+from relpose_ros.inference.uncertainty import FLOOR, camera_covariances, describe_pairs
 from relpose_ros.inference.verdict import judge
 
 UNCALIBRATED = Calibration()
+UNIFORM_VARIANCE = (math.pi**2 / 3 + 2) / 3  # per axis, of a uniformly random rotation's vector
 
 
 def told(scene, calibration=UNCALIBRATED, translations=None):
@@ -30,7 +31,9 @@ def told(scene, calibration=UNCALIBRATED, translations=None):
         distributions = search(energies, GridEmbeddings(scene))
         solutions = solve(energies, distributions)
         pairs = describe_pairs(distributions, energies, solutions.rotations[0], calibration)
-        covariances = camera_covariances(energies, solutions, translations, calibration)
+        covariances = camera_covariances(
+            distributions, energies, solutions.rotations[0], translations, calibration
+        )
     return pairs, covariances, solutions.rotations[0].numpy()
 
 
