@@ -28,9 +28,9 @@ class AscentSettings:
 
     beam: int = 12
     """Partial solutions kept while cameras join."""
-    effort: int = 84
-    """Pairs times climbers: three climbers with 8 views, and more where a climber costs less."""
-    most_climbers: int = 24
+    effort: int = 168
+    """Pairs times climbers: six climbers with 8 views, and more where a climber costs less."""
+    most_climbers: int = 32
     climb_stride: float = math.radians(8)
     """First step of a joint climb, rad."""
     climb_steps: int = 16
@@ -47,7 +47,7 @@ class AscentSettings:
     """Gradient steps at each before they are compared."""
     radii: tuple[float, ...] = tuple(math.radians(a) for a in (12, 8, 5, 3, 2, 1))
     """Neighbourhood of each sweep over the cameras, rad."""
-    last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (2, 1, 0.5, 0.25))
+    last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (2, 1, 0.5, 0.25, 0.12))
     """The same for the best climber alone, at the end."""
     distinct: float = math.radians(10)
     """Solutions are different where some camera differs by more, rad."""

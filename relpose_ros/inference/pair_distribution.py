@@ -34,7 +34,7 @@ class SearchSettings:
     """The widths are meant for so many pairs. Fewer pairs are searched as much wider, up to `widest` times:
     two views then cost what eight do, and are searched nearly densely."""
     widest: int = 8
-    modes: int = 8
+    modes: int = 12
     """Modes looked for a pair."""
     separation: float = math.radians(25)
     """Modes nearer than this are one, rad: the cells of the coarse level are about that far apart."""

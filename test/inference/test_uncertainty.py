@@ -15,7 +15,7 @@ from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.global_rotations import solve
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
-from relpose_ros.inference.uncertainty import FLOOR, camera_covariances, describe_pairs
+from relpose_ros.inference.uncertainty import FLOOR, _turns, camera_covariances, describe_pairs
 from relpose_ros.inference.verdict import judge
 
 UNCALIBRATED = Calibration()
@@ -193,3 +193,13 @@ def test_flat_pairs_are_not_enough(fisher_scene, cameras_around):
 def test_pairs_come_in_order(fisher_scene, cameras_around):
     pairs, _, _ = told(fisher_scene(cameras_around(4, 11)))
     assert [(pair.i, pair.j) for pair in pairs] == list(itertools.combinations(range(4), 2))
+
+
+def test_quick_logarithm_is_the_logarithm():
+    axis = np.random.default_rng(0).standard_normal((40, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    angles = np.r_[
+        0, 1e-9, 1e-4, 1e-3, np.linspace(0.1, 3.1, 32), math.pi - 1e-3, math.pi - 1e-6, math.pi - 1e-9, 3.14
+    ]
+    rotations = so3.exp(axis * angles[:, None])
+    np.testing.assert_allclose(_turns(rotations), so3.log(rotations), atol=1e-9)
