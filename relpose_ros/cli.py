@@ -235,7 +235,8 @@ def _node(arguments: argparse.Namespace) -> int:
 
     weights = arguments.weights
     # Quoted as YAML, which is how ROS reads a parameter: a file may be named 12.
-    given = [] if weights is None else ["--ros-args", "-p", f"weights:='{weights}'", "--"]
+    quoted = str(weights).replace("'", "''")
+    given = [] if weights is None else ["--ros-args", "-p", f"weights:='{quoted}'", "--"]
     return run_node([*given, "--ros-args", *arguments.ros_args])
 
 
