@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from relpose_ros.errors import RelPoseError
+from relpose_ros.network.presets import PRESETS, VARIANTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -182,7 +183,14 @@ def _parser() -> argparse.ArgumentParser:
         help="folders of shards of other objects, to measure on",
     )
     train.add_argument(
-        "--preset", choices=("compact", "paper"), default="compact", help="which network (default: compact)"
+        "--preset", choices=sorted(PRESETS), default="compact", help="which network (default: compact)"
+    )
+    train.add_argument(
+        "--variant",
+        action="append",
+        choices=sorted(VARIANTS),
+        default=[],
+        help="ablation of the paper to train instead; again for several at once",
     )
     train.add_argument(
         "--images", type=int, metavar="K", help="images to see in the whole run (default: the preset's)"
@@ -330,7 +338,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from relpose_ros.training.batches import open_scans
     from relpose_ros.training.trainer import Trainer, settings_for
 
-    settings = replace(settings_for(arguments.preset), seed=arguments.seed)
+    settings = replace(settings_for(arguments.preset, arguments.variant), seed=arguments.seed)
     if arguments.images:
         settings = replace(settings, images=arguments.images)
     held_out = open_scans(arguments.held_out) if arguments.held_out else None

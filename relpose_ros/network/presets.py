@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, get_args, get_origin, get_type_hints
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
+
+from relpose_ros.errors import RelPoseError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+
+class PresetError(RelPoseError):
+    """There is no such preset or variant, or its switches contradict each other."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +78,10 @@ class Preset:
             value = getattr(self, field)
             if get_origin(kind) is Literal and value not in get_args(kind):
                 known = ", ".join(get_args(kind))
-                raise ValueError(f"There is no {field} '{value}' of networks; there are {known}.")
+                raise PresetError(f"There is no {field} '{value}' of networks; there are {known}.")
+        if self.rotation == "regression" and self.correlation is not None:
+            text = "A network that regresses rotations looks at no pairs: its correlation must be None."
+            raise PresetError(text)
 
     @property
     def crop_width(self) -> int:
@@ -114,3 +126,28 @@ PRESETS = {
     ),
 }
 """The two networks this package knows by name."""
+
+VARIANTS: Mapping[str, Mapping[str, Any]] = {
+    "no-index": {"index_encoding": False},
+    "pair-context": {"pair_context": True},
+    "regression": {"rotation": "regression", "correlation": None},
+    "first-camera": {"translation_frame": "first_camera"},
+}
+"""The ablations of the paper, as changes of a preset. Several may be made at once: ``regression`` alone
+regresses poses in the look-at frame, together with ``first-camera`` in that of the first camera."""
+
+
+def named_preset(name: str, variants: Sequence[str] = ()) -> Preset:
+    """A preset with some of the variants.
+
+    Raises:
+        PresetError: There is no preset or variant of that name.
+    """
+    if name not in PRESETS:
+        raise PresetError(f"There is no preset '{name}'; choose among {', '.join(PRESETS)}.")
+    preset = PRESETS[name]
+    for variant in variants:
+        if variant not in VARIANTS:
+            raise PresetError(f"There is no variant '{variant}'; choose among {', '.join(VARIANTS)}.")
+        preset = replace(preset, **VARIANTS[variant])
+    return preset

@@ -25,17 +25,24 @@ from torch.utils.data import DataLoader, Dataset
 from relpose_ros.errors import RelPoseError
 from relpose_ros.geometry import so3, so3_grid
 from relpose_ros.network.checkpoint import random_network, write_network
-from relpose_ros.network.presets import PRESETS
+from relpose_ros.network.presets import named_preset
 from relpose_ros.training.batches import Augmentation, Scans, make_batch
 from relpose_ros.training.objective import Batch, Objective, ObjectiveSettings, Targets, make_targets
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    import numpy.typing as npt
+
+    from relpose_ros.network.features import SceneFeatures
+    from relpose_ros.network.presets import Preset
     from relpose_ros.network.relpose import RelPose
 
     State = dict[str, Any]
+    FloatArray = npt.NDArray[np.float64]
+    BestRotations = Callable[[RelPose, SceneFeatures, list[int], list[int]], FloatArray]
+    """(P, 3, 3) camera_j_from_camera_i of the pairs of one scan."""
 
 PIECE_BYTES = 16 * 2**20
 """Size of the pieces a checkpoint is cut into, so that it passes through stores that refuse large files."""
@@ -54,6 +61,8 @@ class TrainingSettings:
     """How a network is trained. `settings_for` gives those of a preset."""
 
     preset: str = "compact"
+    variants: tuple[str, ...] = ()
+    """Ablations by their names in `relpose_ros.network.presets.VARIANTS`."""
     images: int = 600_000
     """Images seen in the whole run, each time an image is seen counting once."""
     batch_images: int = 64
@@ -77,15 +86,21 @@ class TrainingSettings:
     augmentation: Augmentation = field(default_factory=Augmentation)
     seed: int = 0
 
+    @property
+    def network(self) -> Preset:
+        """The preset with its variants."""
+        return named_preset(self.preset, self.variants)
 
-def settings_for(preset: str) -> TrainingSettings:
-    """The published run for ``paper``, ours for ``compact``.
+
+def settings_for(preset: str, variants: Sequence[str] = ()) -> TrainingSettings:
+    """The published run for ``paper``, ours for ``compact``, and the same run for their variants.
 
     Raises:
-        TrainingError: There is no such preset.
+        PresetError: There is no such preset or variant.
     """
+    network = named_preset(preset, variants)
     if preset == "paper":
-        return TrainingSettings(
+        settings = TrainingSettings(
             preset="paper",
             images=800_000 * 48 * 8,
             batch_images=48 * 8,
@@ -94,12 +109,16 @@ def settings_for(preset: str) -> TrainingSettings:
             decay=0.0,
             curriculum=((0.0, 180.0),),
         )
-    if preset == "compact":
-        return TrainingSettings(
-            objective=ObjectiveSettings(uniform_rotations=256, near_rotations=128, pairs=8, match_weight=0.5)
+    else:
+        settings = TrainingSettings(
+            preset=preset,
+            objective=ObjectiveSettings(uniform_rotations=256, near_rotations=128, pairs=8, match_weight=0.5),
         )
-    text = f"there is no preset {preset!r}; choose among {', '.join(PRESETS)}."
-    raise TrainingError(text)
+    objective = settings.objective
+    if network.rotation == "regression":
+        # One rotation is predicted and none are compared: drawing many would be work for nothing.
+        objective = replace(objective, uniform_rotations=1, near_rotations=0)
+    return replace(settings, variants=tuple(variants), objective=objective)
 
 
 class Trainer:
@@ -138,11 +157,9 @@ class Trainer:
         self._device = torch.device(device)
         self._rank, self._processes = _join(self._device)
         folder.mkdir(parents=True, exist_ok=True)
-        preset = PRESETS[settings.preset]
-        self.network = random_network(preset, settings.seed).to(self._device).train()
-        self.average = (
-            random_network(preset, settings.seed).to(self._device).requires_grad_(requires_grad=False)
-        )
+        self.network = random_network(settings.network, settings.seed).to(self._device).train()
+        self.average = random_network(settings.network, settings.seed).to(self._device)
+        self.average.requires_grad_(requires_grad=False)
         decayed = [p for p in self.network.parameters() if p.ndim > 1]
         plain = [p for p in self.network.parameters() if p.ndim <= 1]
         self._optimizer = torch.optim.AdamW(
@@ -206,7 +223,7 @@ class Trainer:
                     now = time.monotonic()
                     speed = (self.images - last[0]) / (now - last[1])
                     last = (self.images, now)
-                    bar.set_postfix_str(f"{means[1]:.2f} nats, {speed:.0f} images/s")
+                    bar.set_postfix_str(f"rotation {means[1]:.2f}, {speed:.0f} images/s")
                     self._log(means, speed, self.measure() if check else {})
                 if check:
                     self.save()
@@ -263,7 +280,7 @@ class Trainer:
                 "step": self.step,
                 "images": self.images,
                 "seconds": self._seconds,
-                "preset": asdict(PRESETS[self.settings.preset]),
+                "preset": asdict(self.settings.network),
             }
             save_pieces(state, self.folder)
             write_network(
@@ -279,10 +296,10 @@ class Trainer:
     def _resume(self) -> None:
         state = load_pieces(self.folder)
         # As JSON a tuple and a list are the same.
-        if json.dumps(state["preset"]) != json.dumps(asdict(PRESETS[self.settings.preset])):
+        if json.dumps(state["preset"]) != json.dumps(asdict(self.settings.network)):
+            asked = " + ".join([self.settings.preset, *self.settings.variants])
             text = (
-                f"the checkpoint in {self.folder} is of another network than '{self.settings.preset}'; "
-                "name another folder."
+                f"the checkpoint in {self.folder} is of another network than '{asked}'; name another folder."
             )
             raise TrainingError(text)
         self.network.load_state_dict(state["network"])
@@ -393,7 +410,7 @@ class _Steps(Dataset[tuple[Batch, Targets]]):
             generator,
             settings.augmentation,
         )
-        frame = PRESETS[settings.preset].translation_frame
+        frame = settings.network.translation_frame
         return batch, make_targets(batch, settings.objective, generator, translation_frame=frame)
 
 
@@ -421,7 +438,9 @@ ACCURACIES = (
 def pair_accuracy(
     network: RelPose, scans: Scans, *, views: int = 4, count: int = 32, level: int = 2
 ) -> dict[str, float]:
-    """How often a pair's best rotation on a grid is right, for all pairs of scans drawn always alike.
+    """How often a pair's best rotation is right, for all pairs of scans drawn always alike.
+
+    The best on a grid where the network scores rotations, else what it regresses.
 
     Quick, and without the solver: to watch a run, not to compare methods with.
 
@@ -439,17 +458,16 @@ def pair_accuracy(
     training = network.training
     network.eval()
     generator = np.random.default_rng(0)
-    rotations = np.array(so3_grid.grid(level))
-    embeddings = network.embed_relative(torch.from_numpy(rotations).float().to(device))
+    best_rotations = _regressed if network.preset.rotation == "regression" else _best_of_grid(network, level)
     i, j = (index.tolist() for index in np.triu_indices(views, 1))
     errors, angles = [], []
     for _ in range(count):
         batch = make_batch(scans, 1, views, 180.0, generator)
         features = network.encode(batch.images.to(device), batch.crop_parameters.to(device))
-        energies = network.pair_energies(network.pair_contexts(features, i, j), embeddings)[0]
+        best = best_rotations(network, features, i, j)
         rotation = batch.camera_from_world[0, :, :, :3]
         true = rotation[j] @ rotation[i].swapaxes(-1, -2)
-        errors.append(np.degrees(so3.angle_between(rotations[energies.argmax(-1).cpu().numpy()], true)))
+        errors.append(np.degrees(so3.angle_between(best, true)))
         angles.append(np.degrees(so3.angle_between(true, np.eye(3))))
     network.train(training)
     error, angle = np.concatenate(errors), np.concatenate(angles)
@@ -464,6 +482,22 @@ def pair_accuracy(
         correct = float((error[inside] <= 15).mean()) if inside.any() else float("nan")
         figures[f"pair@15_{low:g}-{high:g}"] = correct
     return figures
+
+
+def _best_of_grid(network: RelPose, level: int) -> BestRotations:
+    rotations = np.array(so3_grid.grid(level))
+    embeddings = network.embed_relative(torch.from_numpy(rotations).float().to(network.device))
+
+    def best(network: RelPose, features: SceneFeatures, i: list[int], j: list[int]) -> FloatArray:
+        energies = network.pair_energies(network.pair_contexts(features, i, j), embeddings)[0]
+        return np.asarray(rotations[energies.argmax(-1).cpu().numpy()])
+
+    return best
+
+
+def _regressed(network: RelPose, features: SceneFeatures, i: list[int], j: list[int]) -> FloatArray:
+    rotations = network.optical_rotations(features)[0].double().cpu().numpy()
+    return np.asarray(rotations[j] @ rotations[i].swapaxes(-1, -2))
 
 
 def save_pieces(state: State, folder: Path, piece_bytes: int = PIECE_BYTES) -> None:

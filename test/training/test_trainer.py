@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from relpose_ros.network.checkpoint import read_metadata
+from relpose_ros.network.checkpoint import load_network, read_metadata
+from relpose_ros.network.presets import PRESETS, VARIANTS, PresetError
 from relpose_ros.training import trainer
 from relpose_ros.training.batches import Augmentation, Scans
 from relpose_ros.training.objective import ObjectiveSettings
@@ -90,6 +91,23 @@ def test_it_learns_a_handful_of_scans(tmp_path, fake_shard):
     assert np.mean([loss[1] for loss in losses[-20:]]) < -1.0
 
 
+@pytest.mark.parametrize("frame", [(), ("first-camera",)])
+def test_a_network_that_regresses_learns_poses_too(tmp_path, fake_shard, frame):
+    settings = replace(
+        SETTINGS,
+        variants=("regression", *frame),
+        images=1600,
+        min_views=4,
+        learning_rate=5e-3,
+        augmentation=Augmentation(mirror=0, quarter_turns=0, masked=0, grey=0, gain=0, noisy=0),
+        curriculum=((0.0, 180.0),),
+    )
+    run = Trainer(settings, tmp_path, Scans([fake_shard(1, 4, 32, 0)]))
+    losses = np.array([run.train_step().tolist() for _ in range(150)])
+    assert (losses[-20:].mean(0) < 0.7 * losses[:5].mean(0))[:3].all()
+    assert losses[:, 3].max() == 0  # nothing is matched
+
+
 def test_the_learning_rate_rises_stays_and_falls(tmp_path, scans):
     run = Trainer(SETTINGS, tmp_path, scans)
     rates = []
@@ -130,14 +148,43 @@ def test_a_checkpoint_in_pieces_comes_back_whole_and_damage_is_noticed(tmp_path)
 
 def test_a_checkpoint_of_another_network_is_refused(tmp_path, scans, tiny_preset, monkeypatch):
     Trainer(SETTINGS, tmp_path, scans).save()
-    monkeypatch.setitem(trainer.PRESETS, "tiny", replace(tiny_preset, feedforward_width=8))
+    monkeypatch.setitem(PRESETS, "tiny", replace(tiny_preset, feedforward_width=8))
     with pytest.raises(TrainingError, match="another network"):
         Trainer(SETTINGS, tmp_path, scans)
 
 
-def test_unknown_presets_are_refused():
-    with pytest.raises(TrainingError, match="paper, compact"):
+def test_unknown_presets_and_variants_are_refused():
+    with pytest.raises(PresetError, match="no preset 'large'; choose among paper, compact"):
         trainer.settings_for("large")
+    with pytest.raises(PresetError, match="no variant 'colour'; choose among no-index, pair-context"):
+        trainer.settings_for("compact", ["colour"])
+
+
+@pytest.mark.parametrize("variants", [(), *((name,) for name in VARIANTS), ("regression", "first-camera")])
+def test_every_variant_trains_is_measured_resumed_and_read_back(tmp_path, scans, variants):
+    settings = replace(SETTINGS, images=24, variants=variants)
+    Trainer(replace(settings, images=8), tmp_path, scans, scans).run(progress=False)
+    run = Trainer(settings, tmp_path, scans, scans)
+    assert run.step == 1
+    before = weights(run.network).clone()
+    run.run(progress=False)
+    assert run.finished
+    assert weights(run.network).isfinite().all()
+    assert not weights(run.network).equal(before)
+    assert set(run.measure(count=3)) == set(trainer.ACCURACIES)
+    loaded = load_network(tmp_path / trainer.WEIGHTS)
+    assert loaded.preset == settings.network
+    assert weights(loaded).equal(weights(run.average))
+    others = () if variants else ("no-index",)
+    with pytest.raises(TrainingError, match="of another network than 'tiny"):
+        Trainer(replace(settings, variants=others), tmp_path, scans)
+
+
+def test_a_variant_is_the_published_run_of_another_network():
+    plain, ablated = trainer.settings_for("compact"), trainer.settings_for("compact", ["regression"])
+    assert ablated.network.rotation == "regression"
+    assert replace(ablated, variants=(), objective=plain.objective) == plain
+    assert trainer.settings_for("compact", ["no-index"]).objective == plain.objective
 
 
 def test_pair_accuracy_of_a_network_that_knows_nothing_is_near_chance(tiny_preset, scans):
