@@ -1,0 +1,65 @@
+"""Poses that a network predicts outright, no solver asked: translations, and in one ablation rotations.
+
+Optical frames, column vectors; the object's frame has its origin where the optical axes meet most closely,
+whichever origin the network's preset predicts translations about, and the first camera is at distance 1.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from relpose_ros.geometry.cameras import camera_centre, closest_point_to_axes
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from relpose_ros.network.features import SceneFeatures
+    from relpose_ros.network.relpose import RelPose
+
+    FloatArray = npt.NDArray[np.float64]
+
+LEAST_DISTANCE = 1e-6
+"""Of a camera from the object's origin, in the network's unit: what is predicted may be anything."""
+
+
+@torch.no_grad()
+def predicted_translations(network: RelPose, features: SceneFeatures, rotations: FloatArray) -> FloatArray:
+    """Translations camera_from_object that go with some rotations.
+
+    A network that predicts in the first camera's frame says where the cameras are, not where the object is:
+    the origin is moved to the point closest to the optical axes, as in training (RelPose++, section 3.3).
+
+    Args:
+        network: of any preset.
+        features: of the N views of one scan.
+        rotations: (N, 3, 3) camera_from_object, the first the identity.
+
+    Returns:
+        (N, 3), the first at distance 1.
+    """
+    translations = network.optical_translations(features).double().cpu().numpy()
+    if network.preset.translation_frame == "first_camera":
+        origin = closest_point_to_axes(rotations, camera_centre(rotations, translations))
+        translations = translations + rotations @ origin
+    return np.asarray(translations / max(float(np.linalg.norm(translations[0])), LEAST_DISTANCE))
+
+
+@torch.no_grad()
+def regressed_poses(network: RelPose, features: SceneFeatures) -> tuple[FloatArray, FloatArray]:
+    """Poses camera_from_object of a network that regresses rotations.
+
+    Args:
+        network: of a preset whose ``rotation`` is "regression".
+        features: of the N views of one scan.
+
+    Returns:
+        Rotations (N, 3, 3), the first the identity, and translations (N, 3), the first at distance 1.
+
+    Raises:
+        NetworkUseError: The preset scores rotations instead: use `Estimator`.
+    """
+    rotations = network.optical_rotations(features).double().cpu().numpy()
+    return rotations, predicted_translations(network, features, rotations)
