@@ -36,7 +36,8 @@ _INDEX_TABLE = "feature_extractor.feature_positional_encoding.pos_table_1"
 _EXPECTED = (
     "a RelPose++ checkpoint (.pth with the key 'state_dict') or weights written by 'relpose_ros convert'"
 )
-_NAMES_SHOWN = 40
+_NAMES_SHOWN = 5
+"""Of one kind, in a refusal: enough to see what is wrong in a sentence that one can read."""
 _SIGNATURES = {
     b"version https://git-lfs": "a Git LFS pointer without its file (run 'git lfs pull')",
     b"<": "a web page or XML (did the download ask for a login?)",

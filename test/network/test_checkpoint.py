@@ -104,6 +104,9 @@ def test_nothing_else_is_forgiven_and_the_names_are_listed(compact: RelPose, tmp
     assert "lacks layers.4.bias;" in text
     assert "in excess extra;" in text
     assert "layers.3.weight (2, 2) instead of (128, 128)" in text
+    many = {f"spare{number}": torch.zeros(1) for number in range(400)}
+    text = refusal(released_file(compact, file, **many))
+    assert "in excess spare0, spare1, spare2, spare3, spare4 and 395 more" in text
     broken = compact.state_dict()["layers.1.bias"].clone()
     broken[3] = float("nan")
     assert "infinite or missing in layers.1.bias" in refusal(
