@@ -129,7 +129,8 @@ def replay(
     with _written_whole(output) as folder:
         for name, recording in _folders(recordings).items():
             cells = _cells(estimator, recording)
-            _write(folder / name, recording, settings, truth, rejected, bag.name, cells)
+            known = _truth_of(recording, truth)
+            _write(folder / name, recording, settings, known, rejected, bag.name, cells)
     for name, recording in _folders(recordings).items():
         last = recording.estimates[-1].estimate
         logger.info(
@@ -160,13 +161,17 @@ def _cells(
 
 
 def _ground_truth(reader: BagReader) -> dict[int, TruePose]:
-    """True camera poses by stamp, from every PoseStamped topic called ground_truth/pose."""
+    """True camera poses by stamp, from every PoseStamped topic called ground_truth/pose.
+
+    Stamps with two poses, of cameras that are triggered together, are left out: a pose names no camera.
+    """
     topics = [
         topic
         for topic, kind in reader.topics.items()
         if kind == POSE_STAMPED and f"/{topic}".endswith(f"/{GROUND_TRUTH_TOPIC}")
     ]
-    truth = {}
+    truth: dict[int, TruePose] = {}
+    shared: set[int] = set()
     for record in reader.records(topics):
         stamp, pose = record.message.header.stamp, record.message.pose
         q, p = pose.orientation, pose.position
@@ -177,8 +182,23 @@ def _ground_truth(reader: BagReader) -> dict[int, TruePose]:
                 "The true pose on %s with stamp %d ns is no pose; it is left out.", record.topic, stamp_ns
             )
             continue
-        truth[stamp_ns] = TruePose(so3.from_quaternion_xyzw(quaternion), centre)
-    return truth
+        pose = TruePose(so3.from_quaternion_xyzw(quaternion), centre)
+        if not _same(truth.setdefault(stamp_ns, pose), pose):
+            shared.add(stamp_ns)
+    if shared:
+        logger.warning("%d stamps have several true poses; those are left out.", len(shared))
+    return {stamp_ns: pose for stamp_ns, pose in truth.items() if stamp_ns not in shared}
+
+
+def _same(one: TruePose, other: TruePose) -> bool:
+    turns = np.array_equal(one.world_from_camera, other.world_from_camera)
+    return turns and np.array_equal(one.centre, other.centre)
+
+
+def _truth_of(recording: Recording, truth: Mapping[int, TruePose]) -> dict[int, TruePose]:
+    """The true poses, without those whose stamp several views have: it is one camera's."""
+    views = Counter(record.view.stamp_ns for record in recording.views)
+    return {stamp_ns: pose for stamp_ns, pose in truth.items() if views[stamp_ns] <= 1}
 
 
 def _why_nothing(bag: Path, scanner: Scanner, rejected: Sequence[tuple[str, int]]) -> str:

@@ -27,7 +27,7 @@ pause doubles each time: a camera that stands still must not keep the estimator 
 moves on is soon tried again. By stamps, so that a replay does the same."""
 
 _SEEN = 64
-"""Stamps remembered to tell a picture that comes raw and compressed: no transport lags by more pictures."""
+"""Pictures remembered to tell one that comes raw and compressed: no transport lags by more."""
 
 _logger = logging.getLogger("relpose_ros")
 
@@ -73,8 +73,10 @@ class ScanBuffer:
         self._on_trial: View | None = None
         self._pause_ns = self._paused_until_ns = 0
         self._newest_on: dict[str, int] = {}
-        self._suspects: dict[str, View] = {}
-        self._seen: deque[int] = deque(maxlen=_SEEN)
+        self._suspects: dict[str, list[View]] = {}
+        """Views of one stamp on each topic, from cameras that are triggered together."""
+        self._seen: deque[tuple[int, str]] = deque(maxlen=_SEEN)
+        """Stamp and frame, which are what tells pictures apart whatever topic they come on."""
         self._changed = False
         self._failed = False
         self._base: ScanEstimate | None = None
@@ -86,43 +88,58 @@ class ScanBuffer:
         """The views held, oldest first, without those whose place is not decided yet."""
         return tuple(self._views)
 
-    def declines(self, stamp_ns: int, topic: str) -> Decision | None:
+    def declines(self, stamp_ns: int, frame_id: str, topic: str) -> Decision | None:
         """The answer to a view that would not be taken whatever it shows; None: show it.
 
         Saves decoding it.
         """
         newest_ns = self._newest_ns()
-        jumps = self._jumps_back(stamp_ns, topic) or self._confirms_jump(stamp_ns, topic)
+        jumps = self._jumps_back(stamp_ns, topic) or self._confirms_jump(stamp_ns, frame_id, topic)
         if jumps or newest_ns is None:
             return None
-        if self._was_seen(stamp_ns):
-            return Decision(False, "a view with this stamp was seen already")
-        if stamp_ns <= newest_ns:
+        if self._was_seen(stamp_ns, frame_id):
+            return Decision(False, "a view with this stamp and frame was seen already")
+        if stamp_ns < newest_ns:
             late = f"it is {(newest_ns - stamp_ns) / 1e9:.3f} s older than the scan of {self.object_id!r}"
             return Decision(
                 False, f"{late}, whose newest view has stamp {stamp_text(newest_ns)}", rejected=True
             )
         full = len(self._views) >= self._settings.max_views
         if full and (self._settings.keep == "first" or self._is_paused(stamp_ns)):
-            return self._decline_further(stamp_ns, topic)
+            return self._decline_further(stamp_ns, frame_id, topic)
         return None
 
     def add(self, view: View, topic: str) -> Decision:
         """Take a view, or say why not.
 
+        Views of one stamp are two where their frames differ: of cameras that are triggered together.
+
         A stamp far behind the last one on its topic is a garbage stamp or a clock that jumped backwards. The
         next message on the topic tells which: if it is behind as well and in order, time did jump; or if both
         repeat what was seen before, as in a bag too short for two messages far behind.
         """
-        declined = self.declines(view.stamp_ns, topic)
+        declined = self.declines(view.stamp_ns, view.frame_id, topic)
         if declined is not None:
             return declined
-        if self._confirms_jump(view.stamp_ns, topic):
-            first = self._suspects[topic]
+        if self._confirms_jump(view.stamp_ns, view.frame_id, topic):
+            first = self._suspects[topic][0]
+            together = [
+                (each, origin)
+                for origin, views in self._suspects.items()
+                for each in views
+                if each.stamp_ns == first.stamp_ns
+            ]
             self._follow_jump(first)
-            self._take(first, topic)
+            for each, origin in together:
+                if not self._was_seen(each.stamp_ns, each.frame_id):
+                    self._take(each, origin)
         elif self._jumps_back(view.stamp_ns, topic):
-            self._suspects[topic] = view
+            others = [
+                each
+                for each in self._suspects.get(topic, ())
+                if each.stamp_ns == view.stamp_ns and each.frame_id != view.frame_id
+            ]
+            self._suspects[topic] = [*others, view]
             behind = (self._newest_on[topic] - view.stamp_ns) / 1e9
             text = f"it is {behind:.3f} s older than the last one on this topic: rejected unless the next "
             return Decision(False, text + "one confirms that time jumped backwards", rejected=True)
@@ -201,14 +218,14 @@ class ScanBuffer:
             self._forget(surplus)
 
     def _take(self, view: View, topic: str) -> Decision:
-        """Take a view that is newer than all others."""
-        self._note_time(view.stamp_ns, topic)
+        """Take a view that no other is newer than."""
+        self._note_time(view.stamp_ns, view.frame_id, topic)
         # A newcomer on trial would wait for ever for the estimate that failed.
         self._changed |= self._failed
         self._failed = False
         full = len(self._views) >= self._settings.max_views
         if full and self._settings.keep == "first":
-            return self._decline_further(view.stamp_ns, topic)
+            return self._decline_further(view.stamp_ns, view.frame_id, topic)
         if full and self._settings.keep == "spread":
             self._candidates.append(view)
             if len(self._candidates) > self._settings.max_views:
@@ -222,17 +239,17 @@ class ScanBuffer:
         self._changed, self._base = True, None
         return Decision(True)
 
-    def _decline_further(self, stamp_ns: int, topic: str) -> Decision:
-        self._note_time(stamp_ns, topic)
+    def _decline_further(self, stamp_ns: int, frame_id: str, topic: str) -> Decision:
+        self._note_time(stamp_ns, frame_id, topic)
         self.dropped += 1
         text = f"the scan of {self.object_id!r} has its {len(self._views)} views"
         if self._is_paused(stamp_ns):
             text += ", and one seen just before it gained nothing"
         return Decision(False, text)
 
-    def _note_time(self, stamp_ns: int, topic: str) -> None:
+    def _note_time(self, stamp_ns: int, frame_id: str, topic: str) -> None:
         """Time goes on in this topic: whatever lay far behind was garbage."""
-        self._seen.append(stamp_ns)
+        self._seen.append((stamp_ns, frame_id))
         self._newest_on[topic] = stamp_ns
         self._suspects.pop(topic, None)
 
@@ -252,23 +269,26 @@ class ScanBuffer:
         newest_ns = self._newest_on.get(topic)
         return newest_ns is not None and stamp_ns <= newest_ns - self._backward_jump_ns
 
-    def _confirms_jump(self, stamp_ns: int, topic: str) -> bool:
-        suspect = self._suspects.get(topic)
-        if suspect is None or stamp_ns <= suspect.stamp_ns:
+    def _confirms_jump(self, stamp_ns: int, frame_id: str, topic: str) -> bool:
+        suspects = self._suspects.get(topic)
+        if not suspects or stamp_ns <= suspects[0].stamp_ns:
             return False
-        repeats = self._was_seen(suspect.stamp_ns) and self._was_seen(stamp_ns)
+        first = suspects[0]
+        repeats = self._was_seen(first.stamp_ns, first.frame_id) and self._was_seen(stamp_ns, frame_id)
         return repeats or self._jumps_back(stamp_ns, topic)
 
-    def _was_seen(self, stamp_ns: int) -> bool:
-        return stamp_ns in self._seen or any(view.stamp_ns == stamp_ns for view in self._all())
+    def _was_seen(self, stamp_ns: int, frame_id: str) -> bool:
+        picture = stamp_ns, frame_id
+        return picture in self._seen or any((view.stamp_ns, view.frame_id) == picture for view in self._all())
 
     def _follow_jump(self, first: View) -> None:
         """Forget what lies after the first view of the time that counts from now on."""
         views = self._all()
         ahead = [view for view in views if view.stamp_ns > first.stamp_ns]
-        repeated = self._was_seen(first.stamp_ns)
-        if len(ahead) == 1 and len(views) > 1 and not repeated:
-            text = "The view of %r with stamp %s is dropped: two later messages are older than that."
+        repeated = self._was_seen(first.stamp_ns, first.frame_id)
+        lone = len({view.stamp_ns for view in ahead}) == 1 and len(views) > len(ahead)
+        if lone and not repeated:
+            text = "What was seen of %r with stamp %s is dropped: two later messages are older than that."
             _logger.warning(text, self.object_id, stamp_text(ahead[0].stamp_ns))
             self._forget(ahead)
         elif ahead or repeated:

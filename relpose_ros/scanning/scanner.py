@@ -294,7 +294,11 @@ class Scanner:
         """Give a view to its scan; it is decoded only if the scan may want it."""
         with self._state:
             known = self._scans.get(object_id)
-            decision = None if known is None else known.buffer.declines(source.stamp_ns, source.topic)
+            decision = (
+                None
+                if known is None
+                else known.buffer.declines(source.stamp_ns, source.frame_id, source.topic)
+            )
         if decision is None:
             view = decode()
             with self._state:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import math
@@ -12,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from relpose_ros.geometry import so3
 from relpose_ros.replay import bags
-from relpose_ros.replay.bags import BagReader, BagWriter
+from relpose_ros.replay.bags import BagError, BagReader, BagWriter
 from relpose_ros.replay.pack import pack
 from relpose_ros.replay.replay import ReplayError, replay
 from relpose_ros.scanning.settings import ScanSettings
@@ -302,3 +303,37 @@ def test_a_true_pose_that_is_none_is_left_out(
         replay(tmp_path / "bag", tmp_path / "out", estimator=fake_estimator(truth))
     assert "stamp 1000000000 ns is no pose" in caplog.text
     assert "NaN" not in (tmp_path / "out/report.html").read_text()
+
+
+@pytest.mark.parametrize("truth_of_both", [False, True])
+def test_cameras_that_are_triggered_together_give_a_view_each(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, truth_of_both: bool
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "one")
+
+    def double(record: Record) -> Iterable[Record]:
+        for frame in ("left", "right"):
+            changed = copy.deepcopy(record.message)
+            if record.topic != "/ground_truth/pose":
+                changed.header.frame_id = frame
+            elif frame == "right":
+                if not truth_of_both:
+                    continue
+                changed.pose.position.x += 1.0
+            yield record._replace(topic=f"/{frame}{record.topic}", message=changed)
+
+    rewrite(tmp_path / "one", tmp_path / "both", double)
+    with pytest.raises(BagError, match="several cameras; choose with --topic: /left/image/compressed, "):
+        replay(tmp_path / "both", tmp_path / "out", estimator=fake_estimator(truth))
+    topics = [f"/{frame}/image/compressed" for frame in ("left", "right")]
+    replay(tmp_path / "both", tmp_path / "out", topics=topics, estimator=fake_estimator(truth))
+    views = json.loads((tmp_path / "out/scan.json").read_text())["views"]
+    seen = [(view["stamp_ns"] // 10**9, view["frame_id"]) for view in views]
+    assert seen[:4] == [(1, "left"), (1, "right"), (2, "left"), (2, "right")]
+    page = (tmp_path / "out/report.html").read_text()
+    assert "Against the ground truth, " not in page, "one pose a stamp is one camera's"
+
+    replay(tmp_path / "both", tmp_path / "out", topics=topics[:1], estimator=fake_estimator(truth))
+    page = (tmp_path / "out/report.html").read_text()
+    assert ("Against the ground truth, " in page) != truth_of_both

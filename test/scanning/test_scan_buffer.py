@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 SECOND = 1_000_000_000
 
 
-def view(stamp: float) -> View:
+def view(stamp: float, frame_id: str = "") -> View:
     pixels = np.zeros((8, 8, 3), np.uint8)
-    return View(pixels, BoundingBox(0, 0, 8, 8), 8, 8, stamp_ns=round(stamp * SECOND))
+    return View(pixels, BoundingBox(0, 0, 8, 8), 8, 8, stamp_ns=round(stamp * SECOND), frame_id=frame_id)
 
 
 def buffer_with(*stamps: float, **fields: Any) -> ScanBuffer:
@@ -177,7 +177,7 @@ def test_spread_takes_newcomers_in_turn_and_lets_the_oldest_go(circle_estimator:
 def test_a_late_view_is_rejected_and_a_repeated_one_declined(keep: str) -> None:
     buffer = buffer_with(1.0, 1.5, keep=keep)
     repeated, late, good = add(buffer, 1.0, 1.2, 1.6)
-    assert repeated == Decision(False, "a view with this stamp was seen already")
+    assert repeated == Decision(False, "a view with this stamp and frame was seen already")
     assert late.rejected
     assert (
         late.reason == "it is 0.300 s older than the scan of 'mug', whose newest view has stamp 1.500000000"
@@ -261,6 +261,59 @@ def test_a_topic_that_lags_behind_another_is_no_jump() -> None:
     lagging = add(buffer, 1, 2, 3, 4, topic="b")
     assert not any(each.accepted or each.rejected for each in lagging)
     assert stamps_of(buffer) == [1, 2, 3, 4, 5, 6]
+
+
+PAIR = (("left", "a"), ("right", "a"))
+"""Frame and topic of two cameras that are triggered together."""
+RIG = (("left", "a"), ("right", "b"))
+"""The same, each with a topic of its own."""
+
+
+def add_together(buffer: ScanBuffer, cameras: Any, *stamps: float) -> list[Decision]:
+    return [buffer.add(view(stamp, frame), topic) for stamp in stamps for frame, topic in cameras]
+
+
+def pictures_of(buffer: ScanBuffer) -> list[tuple[float, str]]:
+    return [(each.stamp_ns / SECOND, each.frame_id) for each in buffer.views]
+
+
+@pytest.mark.parametrize("cameras", [PAIR, RIG])
+@pytest.mark.parametrize("keep", ["first", "latest", "spread"])
+def test_cameras_that_are_triggered_together_give_a_view_each(keep: str, cameras: Any) -> None:
+    buffer = ScanBuffer("mug", ScanSettings(keep=keep))
+    assert all(each.accepted for each in add_together(buffer, cameras, 1, 2, 3))
+    assert pictures_of(buffer) == [(stamp, frame) for stamp in (1, 2, 3) for frame in ("left", "right")]
+    repeated = [buffer.add(view(stamp, "right"), "copies") for stamp in (2, 3)]
+    assert repeated == 2 * [Decision(False, "a view with this stamp and frame was seen already")]
+    assert buffer.add(view(2.5, "right"), cameras[1][1]).rejected, "it is late for the scan, whoever took it"
+
+
+@pytest.mark.parametrize("cameras", [PAIR, RIG])
+@pytest.mark.parametrize("count", [2, 3, 8])
+def test_a_bag_of_such_cameras_that_loops_loses_no_view(cameras: Any, count: int) -> None:
+    buffer = ScanBuffer("mug", ScanSettings(keep="latest"))
+    stamps = [10.0 + 2 * k for k in range(count)]
+    for _ in range(3):
+        add_together(buffer, cameras, *stamps)
+        expected = [(stamp, frame) for stamp in stamps for frame in ("left", "right")]
+        assert pictures_of(buffer) == expected[-8:]
+
+
+@pytest.mark.parametrize("cameras", [PAIR, RIG])
+def test_a_picture_that_comes_twice_after_a_jump_is_taken_once(cameras: Any) -> None:
+    buffer = buffer_with(10, 11)
+    both = [(frame, topic) for frame, topic in cameras] + [
+        (frame, f"{topic}/copy") for frame, topic in cameras
+    ]
+    add_together(buffer, both, 20, 21)
+    add_together(buffer, both, 1, 2)
+    assert pictures_of(buffer) == [(1, "left"), (1, "right"), (2, "left"), (2, "right")]
+
+
+def test_such_cameras_with_one_stamp_of_the_future_lose_that_alone() -> None:
+    buffer = ScanBuffer("mug", ScanSettings())
+    add_together(buffer, PAIR, 1, 2, 1e6, 3, 4)
+    assert [stamp for stamp, _ in pictures_of(buffer)] == [1, 1, 2, 2, 3, 3, 4, 4]
 
 
 def test_dropping_the_last_view_has_the_others_estimated_again(circle_estimator: Callable[..., Any]) -> None:
@@ -377,19 +430,27 @@ def test_the_most_redundant_view_is_the_one_with_the_closest_neighbours() -> Non
 @pytest.mark.usefixtures("quiet_log")
 @settings(max_examples=500, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    st.lists(st.tuples(st.sampled_from("ab"), st.floats(0, 20)), max_size=40),
+    st.lists(
+        st.tuples(
+            st.sampled_from("ab"),
+            st.sampled_from(["", "left"]),
+            st.one_of(st.floats(0, 20), st.integers(0, 5)),
+        ),
+        max_size=40,
+    ),
     st.sampled_from(["first", "latest", "spread"]),
 )
 def test_whatever_stamps_come_the_views_are_ordered_and_all_accounted_for(
-    arrivals: list[tuple[str, float]], keep: str
+    arrivals: list[tuple[str, str, float]], keep: str
 ) -> None:
     buffer = ScanBuffer("mug", ScanSettings(keep=keep, max_views=3))
-    for topic, stamp in arrivals:
+    for topic, frame, stamp in arrivals:
         before = buffer.views
-        decision = buffer.add(view(stamp), topic)
+        decision = buffer.add(view(stamp, frame), topic)
         views = buffer.views
         stamps = [each.stamp_ns for each in views]
-        assert stamps == sorted(set(stamps))
+        assert stamps == sorted(stamps)
+        assert len(set(pictures_of(buffer))) == len(views)
         assert len(views) <= 3
         if decision.rejected:
             assert decision.reason
