@@ -203,6 +203,13 @@ def _parser() -> argparse.ArgumentParser:
         default="cpu",
         help="cpu (default), cuda, cuda:1 ... Several processes: start with torchrun",
     )
+    train.add_argument(
+        "--workers",
+        type=int,
+        default=0,
+        metavar="K",
+        help="processes beside it that prepare batches (default: 0)",
+    )
     train.add_argument("--seed", type=int, default=0, help="of the run (default: 0)")
 
     convert = command(
@@ -343,7 +350,9 @@ def _train(arguments: argparse.Namespace) -> int:
         settings = replace(settings, images=arguments.images)
     held_out = open_scans(arguments.held_out) if arguments.held_out else None
     scans = open_scans(arguments.scans)
-    trainer = Trainer(settings, arguments.run_folder, scans, held_out, device=arguments.device)
+    trainer = Trainer(
+        settings, arguments.run_folder, scans, held_out, device=arguments.device, workers=arguments.workers
+    )
     trainer.run(arguments.budget)
     return 0
 

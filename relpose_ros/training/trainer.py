@@ -143,7 +143,7 @@ class Trainer:
             folder: Of the run, made if it is missing.
             scans: To learn from.
             held_out: To measure on, other objects.
-            device: Of this process.
+            device: Of this process; "cuda" alone is, under torchrun, each process's own GPU.
             workers: Processes beside this one that prepare batches; what they prepare does not depend on it.
 
         Raises:
@@ -154,7 +154,7 @@ class Trainer:
         self._scans, self._held_out = scans, held_out
         self._workers = workers
         self._batches: Iterator[tuple[Batch, Targets]] | None = None
-        self._device = torch.device(device)
+        self._device = _own_device(device)
         self._rank, self._processes = _join(self._device)
         folder.mkdir(parents=True, exist_ok=True)
         self.network = random_network(settings.network, settings.seed).to(self._device).train()
@@ -536,6 +536,13 @@ def load_pieces(folder: Path) -> State:
         raise TrainingError(text)
     state: State = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     return state
+
+
+def _own_device(device: str) -> torch.device:
+    own = torch.device(device)
+    if own.type == "cuda" and own.index is None and "LOCAL_RANK" in os.environ:
+        own = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+    return own
 
 
 def _join(device: torch.device) -> tuple[int, int]:

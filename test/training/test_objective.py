@@ -1,6 +1,8 @@
 """The objective: samples with the density they claim, a likelihood however it is sampled."""
 
+import dataclasses
 import math
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -10,8 +12,11 @@ from hypothesis import strategies as st
 
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import camera_centre, closest_point_to_axes
+from relpose_ros.network.presets import PRESETS, VARIANTS, named_preset
+from relpose_ros.network.relpose import RelPose
 from relpose_ros.training import objective
-from relpose_ros.training.objective import Batch, ObjectiveSettings
+from relpose_ros.training.objective import Batch, Objective, ObjectiveSettings
+from relpose_ros.training.trainer import _moved
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -146,3 +151,27 @@ def test_match_loss_rewards_the_true_matches_and_ignores_what_is_not_seen_twice(
     assert objective.match_loss(changed, places, other, 0.1).item() == pytest.approx(0, abs=1e-4)
     nothing = torch.full_like(places, math.nan)
     assert objective.match_loss(right, nothing, other, 0.1).item() == 0
+
+
+@pytest.mark.parametrize("variants", [(), *((name,) for name in VARIANTS), ("regression", "first-camera")])
+@pytest.mark.parametrize("name", PRESETS)
+def test_nothing_is_left_on_the_cpu_when_the_weights_are_elsewhere(name, variants, monkeypatch):
+    """On torch's device without numbers, which refuses tensors of another one as a GPU does."""
+    preset = named_preset(name, variants)
+    with torch.device("meta"):
+        network = RelPose(preset)
+    settings = ObjectiveSettings(uniform_rotations=5, near_rotations=4, match_weight=0.5)
+    targets = objective.make_targets(
+        batch_of(0), settings, np.random.default_rng(0), translation_frame=preset.translation_frame
+    )
+    if preset.correlation is not None:
+        side = preset.correlation.map_side
+        targets = dataclasses.replace(targets, places=torch.zeros(2, 4, side, side, 3))
+    images = torch.empty(2, 4, 3, preset.image_size, preset.image_size, device="meta")
+    monkeypatch.setattr(torch, "autocast", lambda device, enabled: nullcontext())  # which that device lacks
+    meta = torch.device("meta")
+    losses = Objective(network.to(meta), settings)(
+        images, torch.empty(2, 4, 3, device="meta"), _moved(targets, meta)
+    )
+    losses[0].backward()
+    assert losses.device == network.device == meta

@@ -195,6 +195,14 @@ def test_pair_accuracy_of_a_network_that_knows_nothing_is_near_chance(tiny_prese
     assert 60 < figures["pair_median"] < 180
 
 
+def test_under_torchrun_every_process_has_a_gpu_of_its_own(monkeypatch):
+    assert trainer._own_device("cuda") == torch.device("cuda")
+    monkeypatch.setenv("LOCAL_RANK", "3")
+    assert trainer._own_device("cuda") == torch.device("cuda:3")
+    assert trainer._own_device("cuda:1") == torch.device("cuda:1")
+    assert trainer._own_device("cpu") == torch.device("cpu")
+
+
 PROCESS = """
 import pickle, sys
 from pathlib import Path
