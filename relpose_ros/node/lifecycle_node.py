@@ -31,7 +31,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import Trigger
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import MarkerArray
 
 from relpose_ros.errors import RelPoseError
 from relpose_ros.msg import ObjectView, ScanEstimate
@@ -39,7 +39,6 @@ from relpose_ros.node.parameters import changed_settings, declare_parameters
 from relpose_ros.node.reports import NodeHealth, Throttle, diagnostic_status, loss_advice, qos_advice
 from relpose_ros.scanning.scanner import Scanner
 from relpose_ros.scanning.settings import SettingsError
-from relpose_ros.views import MIN_VIEWS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -334,7 +333,8 @@ class ScanNode(LifecycleNode):
         scanner = self._scanner
         if scanner is not None:
             scanner.reset(f"the clock jumped backwards by {-jump.delta.nanoseconds * 1e-9:.3f} s")
-            self._submit(self._clear_markers)
+            if self._active:
+                self._ask_for_estimate()
 
     def _on_incompatible_qos(self, topic: str, subscribing: bool, event: Any) -> None:
         advice = qos_advice(topic, QoSPolicyKind(event.last_policy_kind), subscribing=subscribing)
@@ -405,11 +405,8 @@ class ScanNode(LifecycleNode):
             self._outputs["~/estimate"].publish(estimate_message(estimate, scan, types, frame))
             self._outputs["~/poses"].publish(pose_array(estimate, scan, types, frame))
             self._outputs["~/markers"].publish(markers(estimate, scan, types, frame))
-            done = f"{len(scan.views)} views in {estimate.seconds:.2f} s"
-            self.get_logger().info(f"{estimate.object_id}: {done}: {estimate.status}")
-
-    def _clear_markers(self) -> None:
-        self._outputs["~/markers"].publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL)]))
+            done = f"{len(scan.views)} views in {estimate.seconds:.2f} s: " if estimate.cameras else ""
+            self.get_logger().info(f"{estimate.object_id}: {done}{estimate.status}")
 
     # Services.
 
@@ -417,7 +414,7 @@ class ScanNode(LifecycleNode):
         scanner = self._scanner_if_active(response)
         if scanner is not None:
             forgotten = scanner.reset("a client asked for it")
-            self._submit(self._clear_markers)
+            self._ask_for_estimate()
             response.success, response.message = True, f"{forgotten} views forgotten."
         return response
 
@@ -425,9 +422,6 @@ class ScanNode(LifecycleNode):
         scanner = self._scanner_if_active(response)
         if scanner is not None:
             receipt = scanner.drop_last_view()
-            left = scanner.statistics().scans.get(receipt.object_id)
-            if receipt.accepted and (left is None or left.views < MIN_VIEWS):
-                self._submit(self._clear_markers)  # no estimate will take their place
             self._ask_for_estimate()
             response.success, response.message = receipt.accepted, receipt.reason
         return response
@@ -444,12 +438,11 @@ class ScanNode(LifecycleNode):
             results = None
         if results is None:
             response.success, response.message = False, "The node stopped before the estimate was made."
-        elif not results:
+        elif not (estimates := [each.estimate for each in results if each.estimate.cameras]):
             response.success = False
             response.message = "The estimate failed." if self._failing else "No object has two views yet."
         else:
             response.success = True
-            estimates = [result.estimate for result in results]
             response.message = "; ".join(f"{each.object_id}: {each.status}" for each in estimates)
         return response
 

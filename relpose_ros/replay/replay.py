@@ -111,6 +111,8 @@ def replay(
                     examples.setdefault(reason, receipt.reason)
                 while scanner.pending():
                     for result in scanner.estimate_pending():
+                        if not result.estimate.cameras:  # takes back what a file keeps
+                            continue
                         object_id = result.scan.object_id
                         recording = recordings.setdefault(object_id, Recording(object_id))
                         recording.add(result, record.log_time_ns)

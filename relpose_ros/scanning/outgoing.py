@@ -95,12 +95,15 @@ def markers(estimate: ScanEstimate, scan: Scan, types: MessageTypes, object_fram
     Each camera is a frustum in its view's colour with its index above it; a line joins the cameras of a weak
     pair and says what is wrong with it. All sizes follow the cameras' distances, since the scale may be
     anything. The first marker deletes all earlier ones: there may be fewer views or weak pairs than before.
+    An estimate without cameras is that marker alone.
     """
     header = _scan_header(scan, types, object_frame)
+    array = [_marker(types, header, "", 0, _SPHERE, action=_DELETE_ALL)]
+    if not estimate.cameras:
+        return types["visualization_msgs/msg/MarkerArray"](markers=array)
     positions = np.array([camera.position for camera in estimate.cameras])
     # A size of zero would make the viewer complain.
     size = max(0.2 * float(np.median(np.linalg.norm(positions, axis=1))), 1e-3)
-    array = [_marker(types, header, "", 0, _SPHERE, action=_DELETE_ALL)]
     for axis, colour in enumerate(_AXES):
         tip = size * np.eye(3)[axis]
         array.append(

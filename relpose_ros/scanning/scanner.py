@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, get_args
 
 from relpose_ros.errors import RelPoseError
+from relpose_ros.estimates import Verdict
 from relpose_ros.scanning.incoming import (
     Arrival,
     Pairing,
@@ -23,7 +24,7 @@ from relpose_ros.scanning.incoming import (
     Kind as Kind,  # a word of this module's interface
 )
 from relpose_ros.scanning.scan_buffer import ScanBuffer
-from relpose_ros.views import Scan
+from relpose_ros.views import MIN_VIEWS, Scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -60,7 +61,11 @@ class Receipt:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """An estimate and the views it was made from."""
+    """An estimate and the views it was made from.
+
+    An estimate without cameras takes back what was told of an object, of which less than two views are left
+    now. ``scan`` then holds the views that it had, for their stamps.
+    """
 
     scan: Scan
     estimate: ScanEstimate
@@ -140,6 +145,7 @@ class Scanner:
         self._pairing = Pairing(settings.pairing_queue, round(settings.backward_jump_s * 1e9))
         self._scans: dict[str, _ScanState] = {}
         self._topics: dict[str, _TopicState] = {}
+        self._taken_back: list[Result] = []
         self._failed = 0
         self._last_failure = ""
 
@@ -174,10 +180,13 @@ class Scanner:
     def pending(self) -> bool:
         """Whether ``estimate_pending`` has work to do."""
         with self._state:
-            return any(state.buffer.has_work() for state in self._scans.values())
+            work = any(state.buffer.has_work() for state in self._scans.values())
+            return work or bool(self._taken_back)
 
     def estimate_pending(self) -> list[Result]:
         """Estimate each scan that changed since its last estimate and has two views or more.
+
+        What has to be taken back of others is among the results, in the order in which it happened.
 
         All views that came meanwhile are taken together. Returns after one round: call it again while
         ``pending()``. A result whose scan was reset while it was made is dropped; so is a trial of a
@@ -189,7 +198,7 @@ class Scanner:
             return self._estimate(changed)
 
     def estimate_now(self, object_id: str | None = None) -> list[Result]:
-        """Estimate a scan, or all, changed or not. Empty where none has two views."""
+        """Estimate a scan, or all, changed or not. No result has cameras where none has two views."""
         with self._estimating:
             with self._state:
                 chosen = [self._scans[each] for each in self._scans if object_id in {None, each}]
@@ -212,8 +221,10 @@ class Scanner:
             chosen = [each for each in self._scans if object_id in {None, each}]
             forgotten = 0
             for each in chosen:
-                views = len(self._scans.pop(each).buffer.views)
+                state = self._scans.pop(each)
+                views = len(state.buffer.views)
                 forgotten += views
+                self._take_back(state, state.buffer.views, f"no view is left: {reason}")
                 _logger.info("The scan of %r with %d views is forgotten: %s.", each, views, reason)
             return forgotten
 
@@ -226,8 +237,12 @@ class Scanner:
             # The object seen last stands last.
             chosen = [each for each in reversed(self._scans) if object_id in {None, each}]
             for each in chosen:
-                view = self._scans[each].buffer.drop_last()
+                state = self._scans[each]
+                view = state.buffer.drop_last()
                 if view is not None:
+                    left = state.buffer.views
+                    if len(left) < MIN_VIEWS:
+                        self._take_back(state, (*left, view), "one more view: only one is left")
                     text = f"The view of {each!r} with stamp {stamp_text(view.stamp_ns)} is dropped."
                     return Receipt(True, each, text)
         of = "" if object_id is None else f" of {object_id!r}"
@@ -324,9 +339,28 @@ class Scanner:
 
     def _forget_oldest_scan(self) -> None:
         oldest = next(iter(self._scans))
-        views = len(self._scans.pop(oldest).buffer.views)
+        state = self._scans.pop(oldest)
+        views = len(state.buffer.views)
+        self._take_back(state, state.buffer.views, "no view is left: another object needed the room")
         text = "The scan of %r with %d views is forgotten to make room: max_scans is %d."
         _logger.info(text, oldest, views, self._settings.max_scans)
+
+    def _take_back(self, state: _ScanState, views: tuple[View, ...], status: str) -> None:
+        """Have it told that the last estimate of a scan holds no longer, if there is one."""
+        if state.estimate is not None:
+            nothing = replace(
+                state.estimate,
+                cameras=(),
+                pairs=(),
+                score=0.0,
+                scale_known=False,
+                verdict=Verdict.ONE_MORE_VIEW,
+                weakest_pair=0,
+                status=status,
+                seconds=0.0,
+            )
+            self._taken_back.append(Result(Scan(state.buffer.object_id, views), nothing))
+            state.estimate = state.latency_s = None
 
     def _rejected(self, topic: str, object_id: str, reason: str) -> Receipt:
         with self._state:
@@ -336,7 +370,7 @@ class Scanner:
 
     def _estimate(self, states: list[_ScanState]) -> list[Result]:
         """One estimate of each scan; the state is free while the estimator runs."""
-        results = []
+        results: list[Result] = []
         for state in states:
             with self._state:
                 work, arrived = state.buffer.work(), state.arrived
@@ -356,13 +390,20 @@ class Scanner:
                     self._last_failure = text
                 continue
             with self._state:
+                self._move_taken_back(results)
                 current = self._scans.get(scan.object_id) is state
                 if current and state.buffer.settle(work, estimate):
                     state.estimates += 1
                     state.latency_s = self._clock() - arrived
                     state.estimate = estimate
                     results.append(Result(scan, estimate))
+        with self._state:
+            self._move_taken_back(results)
         return results
+
+    def _move_taken_back(self, results: list[Result]) -> None:
+        results += self._taken_back
+        self._taken_back.clear()
 
 
 @dataclass

@@ -149,7 +149,9 @@ class Graph:
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
-        self.estimates = self.collect(ScanEstimate, "/scan_node/estimate")
+        self.estimates: list[ScanEstimate] = []
+        self.taken_back: list[ScanEstimate] = []
+        self.node.create_subscription(ScanEstimate, "/scan_node/estimate", self._sort, LATCHED)
         self.poses = self.collect(PoseArray, "/scan_node/poses")
         self.markers = self.collect(MarkerArray, "/scan_node/markers")
         self._diagnostics = self.collect(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
@@ -163,6 +165,9 @@ class Graph:
         self._thread.join(PATIENCE_S)
         self.node.destroy_node()
         self.context.shutdown()
+
+    def _sort(self, estimate: ScanEstimate) -> None:
+        (self.estimates if estimate.cameras else self.taken_back).append(estimate)
 
     def collect(self, message_type: type, topic: str, qos: QoSProfile = LATCHED) -> list[Any]:
         messages: list[Any] = []
@@ -254,7 +259,7 @@ class Graph:
     def forget(self) -> None:
         """Have the node forget its views, and this end what came of them."""
         assert self.trigger("reset").success
-        for each in (self.estimates, self.poses, self.markers):
+        for each in (self.estimates, self.taken_back, self.poses, self.markers):
             each.clear()
 
 

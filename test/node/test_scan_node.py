@@ -6,16 +6,20 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from geometry_msgs.msg import PoseArray
 from lifecycle_msgs.msg import Transition
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from relpose_ros.msg import ScanEstimate
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
 OBJECT_VIEW, IMAGE, COMPRESSED, CAMERA_INFO = "/object_view", "/image", "/image/compressed", "/camera_info"
+LAST = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
 
 
 @pytest.fixture
@@ -76,12 +80,30 @@ def test_compressed_images(node: Any, graph: Any, make: Any) -> None:
 def test_who_comes_late_gets_the_last_estimate(node: Any, graph: Any, make: Any) -> None:
     graph.publish(OBJECT_VIEW, *(make.object_view(stamp, "mug") for stamp in (10.0, 11.0)))
     last = graph.estimate_of("mug", views=2)
-    qos = QoSProfile(
-        depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-    )
-    late = graph.collect(ScanEstimate, "/scan_node/estimate", qos)
+    late = graph.collect(ScanEstimate, "/scan_node/estimate", LAST)
     graph.wait_until(lambda: late, "the estimate that was published before")
     assert late == [last]
+
+
+def test_what_was_told_of_views_that_are_forgotten_is_taken_back(node: Any, graph: Any, make: Any) -> None:
+    graph.publish(OBJECT_VIEW, *(make.object_view(stamp, "vase") for stamp in (10.0, 11.0)))
+    last = graph.estimate_of("vase", views=2)
+    assert graph.trigger("reset").message == "2 views forgotten."
+    answer = graph.wait_until(lambda: [e for e in graph.taken_back if e.object_id == "vase"], "no estimate")[
+        0
+    ]
+    assert answer.header == last.header
+    assert answer.status == "no view is left: a client asked for it"
+    assert answer.verdict == ScanEstimate.VERDICT_ONE_MORE_VIEW
+    late = {
+        topic: graph.collect(kind, f"/scan_node/{topic}", LAST)
+        for topic, kind in (("estimate", ScanEstimate), ("poses", PoseArray), ("markers", MarkerArray))
+    }
+    graph.wait_until(lambda: all(late.values()), "the last message of each topic")
+    assert late["estimate"] == [answer]
+    assert [(each.header, list(each.poses)) for each in late["poses"]] == [(answer.header, [])]
+    (shown,) = late["markers"]
+    assert [(each.header, each.action) for each in shown.markers] == [(answer.header, Marker.DELETEALL)]
 
 
 def test_objects_are_estimated_apart(node: Any, graph: Any, make: Any) -> None:
@@ -173,12 +195,11 @@ def test_services(node: Any, graph: Any, make: Any) -> None:
     assert answer.success
     assert answer.message == f"mug: {graph.estimate_of('mug', views=2).status}"
     for service, message in (("drop_last_view", "is dropped."), ("reset", "1 views forgotten.")):
-        graph.markers.clear()
         answer = graph.trigger(service)
         assert answer.success
         assert answer.message.endswith(message)
-        graph.wait_until(lambda: graph.markers, "markers that clear the screen")
-        assert [each.action for each in graph.markers[0].markers] == [Marker.DELETEALL]
+    status = "one more view: only one is left"
+    graph.wait_until(lambda: [each for each in graph.taken_back if each.status == status], status)
 
 
 def test_views_that_other_parameters_leave_are_estimated_at_once(node: Any, graph: Any, make: Any) -> None:

@@ -189,6 +189,24 @@ def test_every_object_has_its_own_folder(tmp_path: Path, capture: Capture, fake_
     assert {each.name for each in (tmp_path / "out").iterdir()} == OUTPUTS
 
 
+def test_an_object_that_made_room_for_another_keeps_its_output(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "one", form="object_view")
+
+    def rename(record: Record) -> Iterable[Record]:
+        record.message.object_id = "early" if record.log_time_ns <= 3 * 10**9 else "later"
+        yield record
+
+    rewrite(tmp_path / "one", tmp_path / "bag", rename)
+    settings = ScanSettings(max_scans=1)
+    replay(tmp_path / "bag", tmp_path / "out", settings=settings, estimator=fake_estimator(truth))
+    for name, counts in (("early", [2, 3]), ("later", [2])):
+        scan = json.loads((tmp_path / "out" / name / "scan.json").read_text())
+        assert [len(each["cameras"]) for each in scan["estimates"]] == counts
+
+
 def test_views_that_make_way_are_numbered_once(
     tmp_path: Path, capture: Capture, fake_estimator: Fake
 ) -> None:

@@ -107,6 +107,18 @@ def test_the_poses_go_out_under_the_same_header(messages: Any, scan: Scan, estim
     )
 
 
+def test_an_estimate_without_cameras_clears_what_was_shown(
+    messages: Any, scan: Scan, estimate: ScanEstimate
+) -> None:
+    nothing = replace(estimate, cameras=(), pairs=(), weakest_pair=0)
+    message = estimate_message(nothing, scan, messages.types, "object")
+    assert (len(message.cameras), len(message.pairs)) == (0, 0)
+    poses = pose_array(nothing, scan, messages.types, "object")
+    assert (poses.header, len(poses.poses)) == (message.header, 0)
+    (marker,) = markers(nothing, scan, messages.types, "object").markers
+    assert (marker.header, marker.action) == (message.header, DELETE_ALL)
+
+
 @pytest.mark.parametrize(
     ("build", "name"),
     [

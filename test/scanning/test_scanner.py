@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from relpose_ros.errors import RelPoseError
+from relpose_ros.estimates import Verdict
 from relpose_ros.scanning.image_decoding import ENCODINGS
 from relpose_ros.scanning.scan_buffer import ScanBuffer
 from relpose_ros.scanning.scanner import Receipt, Scanner, TopicStatistics
@@ -221,8 +222,54 @@ def test_dropping_the_last_view(bag_messages: Any, circle_estimator: Callable[..
     assert dropped == Receipt(True, "can", "The view of 'can' with stamp 5.000000000 is dropped.")
     assert scanner.drop_last_view("mug").accepted
     assert scanner.drop_last_view("jar") == Receipt(False, "jar", "There is no view of 'jar' to drop.")
-    (result,) = drain(scanner)
+    taken_back, result = sorted(drain(scanner), key=lambda each: each.scan.object_id)
     assert (result.scan.object_id, stamps_of(result.scan)) == ("mug", [1, 2])
+    assert (taken_back.scan.object_id, stamps_of(taken_back.scan)) == ("can", [4, 5])
+    assert (taken_back.estimate.cameras, taken_back.estimate.pairs) == ((), ())
+    assert taken_back.estimate.verdict == Verdict.ONE_MORE_VIEW
+    assert taken_back.estimate.status == "one more view: only one is left"
+    assert scanner.statistics().scans["can"].status == ""
+
+
+def test_what_was_told_of_views_that_are_gone_is_taken_back_once(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    scanner = Scanner(circle_estimator(), ScanSettings(max_scans=2))
+    for object_id in ("mug", "can"):
+        send_views(scanner, bag_messages, 1, 2, object_id=object_id)
+    drain(scanner)
+    send_views(scanner, bag_messages, 5, object_id="jar")
+    scanner.reset("a test asked for it")
+    scanner.reset("again")
+    assert scanner.pending()
+    results = scanner.estimate_pending()
+    assert [(each.scan.object_id, each.estimate.status) for each in results] == [
+        ("mug", "no view is left: another object needed the room"),
+        ("can", "no view is left: a test asked for it"),
+    ], "nothing was told of the jar"
+    assert not any(each.estimate.cameras for each in results)
+    assert not scanner.pending()
+
+
+def test_what_is_taken_back_comes_in_the_order_in_which_it_happened(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    """Else a client that keeps the last message would keep the wrong one."""
+    inner = circle_estimator()
+
+    def estimate(scan: Scan) -> ScanEstimate:
+        if scan.object_id == "can":  # while the new mug waits, its old estimate made
+            scanner.reset("a test asked for it", "mug")
+            send_views(scanner, bag_messages, 3, 4)
+        return inner.estimate(scan)
+
+    scanner = Scanner(SimpleNamespace(estimate=estimate), ScanSettings())
+    send_views(scanner, bag_messages, 1, 2)
+    send_views(scanner, bag_messages, 1, 2, object_id="can")
+    told = [
+        (each.scan.object_id, stamps_of(each.scan), len(each.estimate.cameras)) for each in drain(scanner)
+    ]
+    assert told == [("mug", [1, 2], 2), ("mug", [1, 2], 0), ("can", [1, 2], 2), ("mug", [3, 4], 2)]
 
 
 def test_an_estimate_may_be_asked_for(bag_messages: Any, circle_estimator: Callable[..., Any]) -> None:
