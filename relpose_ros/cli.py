@@ -76,7 +76,11 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("bag", type=Path, help="rosbag2 folder, or a single .mcap or .db3 file")
     replay.add_argument("--output", type=Path, required=True, metavar="DIR", help="where the results go")
     replay.add_argument(
-        "--topic", action="append", metavar="NAME", help="image topic to read; again for more (default: all)"
+        "--topic",
+        action="append",
+        metavar="NAME",
+        help="topic of images or ObjectView; again for more (default: all ObjectView topics, else the images "
+        "of the camera, where there is but one)",
     )
     replay.add_argument(
         "--config",
@@ -227,10 +231,20 @@ def _parser() -> argparse.ArgumentParser:
 def _add_weights(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weights",
-        type=Path,
+        type=_home_path,
         metavar="FILE",
         help="network weights: safetensors or a released checkpoint (default: the compact ones that ship)",
     )
+
+
+def _home_path(text: str) -> Path:
+    """A path that may begin with ~, which shells leave alone in ``--weights=~/file``."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError as err:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} begins with the home folder of a user who does not exist"
+        ) from err
 
 
 def _view_counts(text: str) -> tuple[int, ...]:

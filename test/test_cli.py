@@ -88,6 +88,16 @@ def test_numbers_of_views():
     assert cli._parser().parse_args(["evaluate", "capture", "--views", "4"]).views == (4,)
 
 
+def test_the_weights_may_lie_in_the_home_folder(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    arguments = cli._parser().parse_args(["evaluate", "capture", "--weights=~/mine.safetensors"])
+    assert arguments.weights == tmp_path / "mine.safetensors"
+    with pytest.raises(SystemExit) as end:
+        cli.main(["evaluate", "capture", "--weights=~no body/mine.safetensors"])
+    assert end.value.code == 2
+    assert "'~no body/mine.safetensors' begins with the home folder of a user" in capsys.readouterr().err
+
+
 def test_a_missing_extra_is_named(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "moderngl", None)
     for name in [each for each in sys.modules if each.startswith("relpose_ros.captures.render")]:
@@ -124,7 +134,7 @@ def test_the_commands_need_no_ros(tmp_path):
     assert "missing_bag does not exist" in done.stderr
 
 
-def test_a_capture_becomes_a_bag_an_estimate_and_a_row(tmp_path, posed_capture, random_weights):
+def test_a_capture_becomes_a_bag_an_estimate_and_a_row(tmp_path, posed_capture, random_weights, monkeypatch):
     """The main road from end to end, on a tiny capture and a network that knows nothing."""
     bag, out, rows = tmp_path / "bag", tmp_path / "out", tmp_path / "rows.json"
     assert cli.main(["pack", str(posed_capture), "--output", str(bag)]) == 0
@@ -132,6 +142,13 @@ def test_a_capture_becomes_a_bag_an_estimate_and_a_row(tmp_path, posed_capture, 
     scan = json.loads((out / "scan.json").read_text())
     assert [len(estimate["views"]) for estimate in scan["estimates"]] == [2, 3]
     assert (out / "report.html").stat().st_size > 10_000
+
+    parameters = tmp_path / "parameters.yaml"
+    parameters.write_text("/**:\n  ros__parameters:\n    weights: ~/random.safetensors\n")
+    monkeypatch.setenv("HOME", str(random_weights.parent))
+    again = tmp_path / "again"
+    assert cli.main(["replay", str(bag), "--output", str(again), "--config", str(parameters)]) == 0
+    assert (again / "scan.json").read_bytes() == (out / "scan.json").read_bytes()
 
     evaluate = ["evaluate", str(posed_capture), "--views", "2..3", "--orders", "1", "--output", str(rows)]
     assert (

@@ -15,7 +15,6 @@ import traceback
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from copy import copy
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -248,12 +247,12 @@ class ScanNode(LifecycleNode):
     # What configuring makes.
 
     def _load_estimator(self) -> SupportsEstimate:
-        weights, threads = self._settings.weights, self._settings.threads
+        weights, threads = self._settings.weights_path, self._settings.threads
         self.get_logger().info(f"Loading {weights or 'the shipped weights'}.")
         # Imported here, as is all that needs PyTorch: that takes seconds, in which a signal must be heard.
         from relpose_ros.inference.estimator import Estimator
 
-        return Estimator.from_weights(Path(weights) if weights else None, threads or None)
+        return Estimator.from_weights(weights, threads or None)
 
     def _make_outputs(self) -> None:
         for name, message_type in OUTPUTS:

@@ -146,9 +146,7 @@ def replay(
 def _learned_estimator(weights: Path | None, settings: ScanSettings) -> SupportsEstimate:
     from relpose_ros.inference.estimator import Estimator
 
-    if weights is None and settings.weights:
-        weights = Path(settings.weights)
-    return Estimator.from_weights(weights, settings.threads or None)
+    return Estimator.from_weights(weights or settings.weights_path, settings.threads or None)
 
 
 def _cells(

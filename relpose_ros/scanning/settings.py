@@ -101,7 +101,9 @@ class ScanSettings:
         fixed=True,
     )
     weights: str = _setting(
-        "", "Path of a weights file; empty: the compact weights that ship with the package."
+        "",
+        "Path of a weights file, where ~ is the home folder; empty: the compact weights that ship with the "
+        "package.",
     )
     threads: int = _setting(
         0,
@@ -132,6 +134,21 @@ class ScanSettings:
                 raise SettingsError(text)
         if not self.image_transports:
             raise SettingsError("image_transports is empty: name raw, compressed or both.")
+
+    @property
+    def weights_path(self) -> Path | None:
+        """The weights file, or None for the weights that ship.
+
+        Raises:
+            SettingsError: It begins with the home folder of a user who does not exist.
+        """
+        try:
+            return Path(self.weights).expanduser() if self.weights else None
+        except RuntimeError as err:
+            text = (
+                f"weights is {self.weights!r}: it begins with the home folder of a user who does not exist."
+            )
+            raise SettingsError(text) from err
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> ScanSettings:

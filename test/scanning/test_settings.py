@@ -93,3 +93,12 @@ def test_a_wrong_parameter_file_is_refused(tmp_path: Path, text: str, said: str)
 def test_a_missing_parameter_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="cannot be read"):
         ScanSettings.from_yaml(tmp_path / "absent.yaml")
+
+
+def test_the_weights_may_lie_in_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert ScanSettings().weights_path is None
+    assert ScanSettings(weights="~/mine.safetensors").weights_path == tmp_path / "mine.safetensors"
+    assert ScanSettings(weights="/a/~b").weights_path == Path("/a/~b")
+    with pytest.raises(SettingsError, match="'~no body/w': it begins with the home folder of a user"):
+        _ = ScanSettings(weights="~no body/w").weights_path
