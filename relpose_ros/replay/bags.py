@@ -12,7 +12,7 @@ import os
 import shutil
 import sys
 from collections import Counter
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -320,11 +320,19 @@ class BagWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Write index and metadata, or leave the unfinished file where an error came up."""
+        """Write index and metadata; or remove the unfinished bag where an error came up.
+
+        Raises:
+            BagError: The file system refuses.
+        """
         if error is None:
-            self._writer.close()
+            try:
+                self._writer.close()
+            except OSError as err:
+                self._remove()
+                raise self._not_written(err) from err
         else:
-            self._writer.abort()
+            self._remove()
 
     def add_topic(self, topic: str, type_name: str, *, latched: bool = False) -> None:
         """Announce a topic; ``latched`` ones are offered to late joiners when the bag is played."""
@@ -336,11 +344,26 @@ class BagWriter:
         )
 
     def write(self, topic: str, log_time_ns: int, message: object) -> None:
-        """Append a message to an announced topic."""
+        """Append a message to an announced topic.
+
+        Raises:
+            BagError: The file system refuses.
+        """
         connection = self._connections[topic]
-        self._writer.write(
-            connection, log_time_ns, self._typestore.serialize_cdr(message, connection.msgtype)
-        )
+        data = self._typestore.serialize_cdr(message, connection.msgtype)
+        try:
+            self._writer.write(connection, log_time_ns, data)
+        except OSError as err:
+            raise self._not_written(err) from err
+
+    def _not_written(self, err: OSError) -> BagError:
+        return BagError(f"{self._path} cannot be written: {err.strerror}.")
+
+    def _remove(self) -> None:
+        # What cannot be written may not be closed in good order either.
+        with suppress(OSError):
+            self._writer.abort()
+        shutil.rmtree(self._path, ignore_errors=True)
 
 
 @dataclass(frozen=True)

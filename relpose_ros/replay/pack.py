@@ -17,6 +17,7 @@ from relpose_ros.replay.bags import (
     BagError,
     BagWriter,
 )
+from relpose_ros.scanning.image_decoding import ImageError, compressed_format, decode_compressed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -60,7 +61,8 @@ def pack(
 
     Raises:
         CaptureError: The capture cannot be read.
-        BagError: The output exists, or a photo was asked for that is not there.
+        BagError: The output exists, a photo was asked for that is not there, or one is no JPEG or PNG of the
+            size that cameras.json says.
     """
     loaded = load_capture(capture)
     chosen = range(len(loaded.photos)) if views is None else views
@@ -122,11 +124,24 @@ class _Messages:
         )
 
     def compressed(self, photo: Photo) -> Any:
-        return self._types[COMPRESSED_IMAGE](
-            header=self._header(CAMERA_FRAME),
-            format="png" if photo.file.suffix.lower() == ".png" else "jpeg",
-            data=np.frombuffer(photo.file.read_bytes(), np.uint8),
+        try:
+            data = photo.file.read_bytes()
+        except OSError as err:
+            raise BagError(f"{photo.file} cannot be read: {err.strerror}.") from err
+        stated_format = compressed_format(data)
+        if stated_format is None:
+            raise BagError(f"{photo.file} is neither a JPEG nor a PNG, whatever its name: convert it first.")
+        message = self._types[COMPRESSED_IMAGE](
+            header=self._header(CAMERA_FRAME), format=stated_format, data=np.frombuffer(data, np.uint8)
         )
+        try:
+            height, width, _ = decode_compressed(message).shape
+        except ImageError as err:
+            raise BagError(f"{photo.file} is damaged: {err}.") from err
+        if (width, height) != (photo.width, photo.height):
+            text = f"{photo.file} has {width} x {height} pixels, but its entry in cameras.json says "
+            raise BagError(f"{text}{photo.width} x {photo.height}.")
+        return message
 
     def object_view(self, photo: Photo, object_id: str) -> Any:
         mask = photo.read_mask()

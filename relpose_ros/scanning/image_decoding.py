@@ -129,6 +129,13 @@ def compressed_size(message: Any) -> tuple[int, int]:
     return _compressed_header(_bytes(message.data).tobytes(), message.format)[:2]
 
 
+def compressed_format(data: bytes) -> str | None:
+    """What ``format`` of a sensor_msgs/CompressedImage says of such data: jpeg or png; None: neither."""
+    if data.startswith(_PNG_SIGNATURE):
+        return "png"
+    return "jpeg" if data.startswith(_JPEG_START) else None
+
+
 def decode_compressed(message: Any, region: Region | None = None) -> Pixels:
     """A part of a JPEG or PNG in a sensor_msgs/CompressedImage as RGB.
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import logging
+import resource
 import sqlite3
 from pathlib import Path
 from typing import Any, Literal
@@ -385,3 +386,25 @@ def test_topics_without_messages_are_no_choice() -> None:
     bag = Topics({"/a/image": IMAGE, "/b/image": IMAGE, "/camera_info": CAMERA_INFO})
     bag.counts["/a/image"] = 0
     assert set(choose_inputs(bag)) == {"/b/image", "/camera_info"}
+
+
+@pytest.mark.parametrize("count", [1, 300])
+def test_a_bag_for_which_there_is_no_room_is_told_and_removed(tmp_path: Path, count: int) -> None:
+    """At the end, and on the way."""
+    random = np.random.default_rng(0)
+
+    def fill() -> None:
+        with BagWriter(tmp_path / "bag") as bag:
+            bag.add_topic("/a", STRING)
+            for time in range(count):
+                text = random.integers(97, 122, 20_000).astype(np.uint8).tobytes().decode()
+                bag.write("/a", time, bag.types[STRING](data=text))
+
+    allowed = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, allowed[1]))
+    try:
+        with pytest.raises(BagError, match="bag cannot be written: File too large"):
+            fill()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, allowed)
+    assert not (tmp_path / "bag").exists()

@@ -2,10 +2,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import pytest
 
-from relpose_ros.captures.folder import CaptureError, load_capture
+from relpose_ros.captures.folder import CaptureError, Photo, load_capture
 from relpose_ros.geometry import so3
 from relpose_ros.replay.bags import BagError, BagReader
 from relpose_ros.replay.pack import pack
@@ -81,6 +82,51 @@ def test_the_same_photos_give_the_same_bytes(tmp_path: Path, capture: tuple[Path
         pack(capture[0], tmp_path / name / "bag")
     for file in ("bag.mcap", "metadata.yaml"):
         assert (tmp_path / "one/bag" / file).read_bytes() == (tmp_path / "two/bag" / file).read_bytes()
+
+
+def test_a_photo_is_labelled_by_what_it_is(tmp_path: Path, capture: tuple[Path, Any]) -> None:
+    folder, _ = capture
+    photo = folder / "images/001.jpg"
+    photo.write_bytes(cv2.imencode(".png", cv2.imread(str(photo)))[1].tobytes())
+    pack(folder, tmp_path / "bag")
+    assert [each.format for each in read(tmp_path / "bag")["/image/compressed"][:3]] == [
+        "jpeg",
+        "png",
+        "jpeg",
+    ]
+
+
+@pytest.mark.parametrize("form", ["image", "object_view"])
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda picture: cv2.imencode(".webp", picture)[1].tobytes(), "neither a JPEG nor a PNG"),
+        (lambda _: b"", "neither a JPEG nor a PNG"),
+        (lambda picture: cv2.imencode(".jpg", picture)[1].tobytes()[:-9], "is damaged: .* are cut off"),
+        (lambda picture: cv2.imencode(".jpg", picture[::2])[1].tobytes(), "64 x 24 pixels, .* says 64 x 48"),
+    ],
+)
+def test_a_photo_that_nobody_could_use_leaves_no_half_bag(
+    tmp_path: Path, capture: tuple[Path, Any], form: Any, spoil: Callable[[Any], bytes], said: str
+) -> None:
+    folder, _ = capture
+    photo = folder / "images/003.jpg"
+    photo.write_bytes(spoil(cv2.imread(str(photo))))
+    with pytest.raises(BagError, match=f"003.jpg .*{said}"):
+        pack(folder, tmp_path / "deep/bag", form=form)
+    assert not (tmp_path / "deep/bag").exists()
+
+
+def test_an_interrupted_pack_leaves_no_half_bag(
+    tmp_path: Path, capture: tuple[Path, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Photo, "read_mask", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        pack(capture[0], tmp_path / "bag", form="object_view")
+    assert not (tmp_path / "bag").exists()
 
 
 def test_what_cannot_be_packed_is_told(tmp_path: Path, capture: tuple[Path, Any]) -> None:
