@@ -2,8 +2,9 @@
 
 Cameras join in the order of a maximum spanning tree over the pairs' modes. Where RelPose++ keeps one
 rotation per camera (the best mode along the tree), a beam of partial solutions is kept here, each camera
-tried at every mode of every pair that ties it to those already placed. The best ends climb by block
-coordinate ascent with a shrinking neighbourhood, then all rotations together along the gradient.
+tried at every mode of every pair that ties it to those already placed. The best ends climb, all rotations
+together along the gradient. Where pairs still contradict each other, beams grow from the other cameras too,
+cameras jump to other modes, and the best climb by block coordinate ascent with a shrinking neighbourhood.
 """
 
 from __future__ import annotations
@@ -24,37 +25,45 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AscentSettings:
-    """How the joint maximum is looked for."""
+    """How the joint maximum is looked for. Numbers of solutions are for a full scan; see `many`."""
 
-    beam: int = 12
+    full_scan: int = 28
+    """Pairs that those numbers are meant for, 8 views."""
+    most: int = 64
+    beam: int = 20
     """Partial solutions kept while cameras join."""
-    effort: int = 168
-    """Pairs times climbers: six climbers with 8 views, and more where a climber costs less."""
-    most_climbers: int = 32
+    screened: int = 100
+    """Ways to add a camera to the beam that are evaluated, the best by what the coarse grid remembers."""
+    starts: int = 8
+    """Complete solutions that climb."""
     climb_stride: float = math.radians(8)
-    """First step of a joint climb, rad."""
+    """First step of a climb, rad."""
     climb_steps: int = 16
-    jumps: int = 1
-    """Sweeps in which a camera may leave for any mode of its pairs."""
     content: float = 1.5
     """Nats a pair. Where the pairs of a scan, or of a camera, are on average this near to their highest
     modes, no other place is looked for: the best could gain no more. Scans whose pairs agree become cheap."""
-    reach: float = 0.5
-    """Nats a pair: a solution further below the best one is told as it is, and not refined."""
-    hops: int = 4
-    """Places considered for a camera in such a sweep: so many modes, and so many cells of the coarse grid."""
+    jumpers: int = 3
+    """Solutions whose cameras may leave for any mode of their pairs."""
+    hops: int = 6
+    """Modes considered for such a camera; and cells of the coarse grid, as many."""
     hop_steps: int = 6
     """Gradient steps at each before they are compared."""
-    radii: tuple[float, ...] = tuple(math.radians(a) for a in (12, 8, 5, 3, 2, 1))
-    """Neighbourhood of each sweep over the cameras, rad."""
-    last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (2, 1, 0.5, 0.25, 0.12))
-    """The same for the best climber alone, at the end."""
+    finalists: int = 2
+    """Solutions that are refined, and"""
+    reach: float = 0.25
+    """nats a pair by which they may lie below the best one."""
+    radii: tuple[float, ...] = tuple(math.radians(a) for a in (12, 6, 3, 6, 4, 3))
+    """Neighbourhood of each sweep over their cameras, rad; wider again once all have moved."""
+    last_radii: tuple[float, ...] = tuple(
+        math.radians(a) for a in (2, 1.5, 1, 1, 0.5, 0.5, 0.25, 0.25, 0.12, 0.06)
+    )
+    """The same for the winner alone, at the end."""
     distinct: float = math.radians(10)
     """Solutions are different where some camera differs by more, rad."""
 
-    def climbers(self, pairs: int) -> int:
-        """How many solutions are climbed for so many pairs."""
-        return min(self.most_climbers, max(3, round(self.effort / pairs)))
+    def many(self, count: int, pairs: int) -> int:
+        """A number of solutions for so many pairs: the fewer these are, the less a solution costs."""
+        return min(self.most, round(count * self.full_scan / pairs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,37 +87,35 @@ def solve(
     energies: PairEnergies, distributions: PairDistributions, settings: AscentSettings = AscentSettings()
 ) -> JointSolutions:
     """The joint maximum and the other local maxima that were met on the way."""
-    climbers = settings.climbers(energies.count)
-    starts, scores = _starts(energies, distributions, 0, settings)
-    finalists = starts[:climbers]
+    count = settings.many(settings.starts, energies.count)
+    starts, scores = _climbed(energies, _grow(energies, distributions, 0, settings), count, settings)
+    refined = starts[:0]
     if distributions.mode_energies[:, 0].sum() - scores[0] > settings.content * energies.count:
-        more = [
-            _starts(energies, distributions, root, settings)[0]
-            for root in range(1, min(climbers, energies.views))
-        ]
-        starts, _ = _best(energies, torch.cat([starts, *more]), 2 * climbers, settings.distinct)
-        finalists = starts[:climbers]
-        for _ in range(settings.jumps):
-            finalists = _jump(energies, distributions, finalists, settings)
-        finalists, scores = _best(energies, torch.cat([finalists, starts]), climbers, settings.distinct)
-        finalists = finalists[scores > scores[0] - settings.reach * energies.count]
+        # One beam favours what its first pairs agree on: each camera's turn as the root has another order.
+        roots = range(1, energies.views)
+        grown = torch.cat([starts, *(_grow(energies, distributions, root, settings) for root in roots)])
+        starts, _ = _climbed(energies, grown, count, settings)
+        jumpers = starts[: settings.many(settings.jumpers, energies.count)]
+        jumpers = torch.cat([_jump(energies, distributions, jumpers, settings), starts])
+        finalists = settings.many(settings.finalists, energies.count)
+        refined, scores = _best(energies, jumpers, finalists, settings.distinct)
+        refined = refined[scores > scores[0] - settings.reach * energies.count]
         for radius in settings.radii:
-            finalists = _sweep(energies, finalists, radius)
+            refined = _sweep(energies, refined, radius)
     # Jumps may all end on one hill: where they started is kept beside, for a runner-up to be told.
-    rotations, _ = _best(energies, torch.cat([finalists, starts]), climbers, settings.distinct)
+    rotations, _ = _best(energies, torch.cat([refined, starts]), count, settings.distinct)
     winner = rotations[:1]
     for radius in settings.last_radii:
         winner = _sweep(energies, winner, radius)
-    rotations, scores = _best(energies, torch.cat([winner, rotations[1:]]), climbers, settings.distinct)
+    rotations, scores = _best(energies, torch.cat([winner, rotations[1:]]), count, settings.distinct)
     return JointSolutions(rotations, scores)
 
 
-def _starts(
-    energies: PairEnergies, distributions: PairDistributions, root: int, settings: AscentSettings
+def _climbed(
+    energies: PairEnergies, rotations: torch.Tensor, count: int, settings: AscentSettings
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The ends of one beam, climbed; best first. -> (S, N, 3, 3), (S,)."""
-    count = 2 * settings.climbers(energies.count)
-    rotations, _ = _best(energies, _grow(energies, distributions, root, settings), count, settings.distinct)
+    """The best distinct ones of some solutions, climbed; best first. -> (S, N, 3, 3), (S,)."""
+    rotations, _ = _best(energies, rotations, count, settings.distinct)
     rotations = _climb(energies, rotations, settings.climb_stride, settings.climb_steps)
     return _best(energies, rotations, count, settings.distinct)
 
@@ -148,17 +155,25 @@ def _grow(
 ) -> torch.Tensor:
     """A beam of complete starts. -> (B, N, 3, 3)."""
     order = spanning_order(distributions.mode_log_densities[:, 0], energies.pair_of, root)
+    width = settings.many(settings.beam, energies.count)
     beam = torch.eye(3, dtype=torch.float64).expand(1, energies.views, 3, 3).clone()
     scores = torch.zeros(1, dtype=torch.float64)
     for position in range(1, len(order)):
         camera, placed = order[position], order[:position]
         candidates = _mode_candidates(energies, distributions, beam, camera, placed)  # (B, C, 3, 3)
-        gains = _conditional(energies, beam, camera, placed, candidates)  # (B, C)
-        totals = (scores[:, None] + gains).flatten()
         parents = torch.arange(len(beam)).repeat_interleave(candidates.shape[1])
+        candidates = candidates.flatten(0, 1)
+        if len(candidates) > settings.screened:
+            guesses = _remembered(
+                energies, distributions, beam, camera, placed, candidates.view(len(beam), -1, 3, 3)
+            )
+            by_guess = torch.argsort((scores[:, None] + guesses).flatten(), descending=True, stable=True)
+            parents, candidates = (each[by_guess[: settings.screened]] for each in (parents, candidates))
         grown = beam[parents]
-        grown[:, camera] = candidates.flatten(0, 1)
-        keep = _distinct(grown[:, order[: position + 1]], totals, settings.beam, settings.distinct)
+        gains = _conditional(energies, grown, camera, placed, candidates[:, None])[:, 0]
+        grown[:, camera] = candidates
+        totals = scores[parents] + gains
+        keep = _distinct(grown[:, order[: position + 1]], totals, width, settings.distinct)
         beam, scores = grown[keep], totals[keep]
     return beam
 
@@ -251,7 +266,7 @@ def _jump(
         modes = _mode_candidates(energies, distributions, moving, camera, others)
         gains = _conditional(energies, moving, camera, others, modes)
         cells = distributions.coarse_rotations.expand(len(moving), -1, -1, -1)
-        guesses = _coarse_conditional(energies, distributions, moving, camera, others)
+        guesses = _remembered(energies, distributions, moving, camera, others, cells)
         starts = torch.cat(
             [
                 pick(modes, peaks(modes, gains, settings.hops, settings.distinct)[0]),
@@ -284,25 +299,25 @@ def _climb_camera(
     return hills.view_as(starts), heights.view(starts.shape[:2])
 
 
-def _coarse_conditional(
+def _remembered(
     energies: PairEnergies,
     distributions: PairDistributions,
     rotations: torch.Tensor,
     camera: int,
     others: list[int],
+    candidates: torch.Tensor,
 ) -> torch.Tensor:
-    """What the coarse grid remembers of `_conditional`, for the camera at each of its cells. -> (S, C).
+    """What the coarse grid remembers of `_conditional`. (S, N, 3, 3) and (S, C, 3, 3) -> (S, C).
 
     No energy is evaluated: each relative rotation takes the value of the cell that it falls nearest to.
     """
-    cells = distributions.coarse_rotations
-    flat = cells.flatten(1).float()
-    totals = torch.zeros(len(rotations), len(cells), dtype=torch.float64)
+    cells = distributions.coarse_rotations.flatten(1).float()
+    totals = torch.zeros(candidates.shape[:2], dtype=torch.float64)
     for other in others:
-        relative = cells @ rotations[:, other, None].mT  # (S, C, 3, 3)
+        relative = candidates @ rotations[:, other, None].mT  # (S, C, 3, 3)
         if camera < other:
             relative = relative.mT
-        likeness = relative.flatten(2).float() @ flat.T  # traces; numpy finds their maxima ten times sooner
+        likeness = relative.flatten(2).float() @ cells.T  # traces; numpy finds their maxima ten times sooner
         nearest = torch.from_numpy(likeness.numpy().argmax(-1))
         totals += distributions.coarse[energies.pair_of[camera, other]][nearest]
     return totals
