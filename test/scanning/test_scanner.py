@@ -107,6 +107,21 @@ def test_a_picture_that_comes_raw_and_compressed_is_one_view(
     assert scanner.statistics().scans["object"].views == 2
 
 
+def test_two_cameras_that_are_triggered_together_are_two_views(
+    messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    scanner = Scanner(circle_estimator(), ScanSettings())
+    both = [(stamp, frame) for stamp in (1, 2) for frame in ("left", "right")]
+    for stamp, frame in both:
+        assert send_views(scanner, messages, stamp, frame_id=frame) == [Receipt(True, "mug", "")]
+    (again,) = send_views(scanner, messages, 2, frame_id="left")
+    assert again == Receipt(
+        False, "mug", "views, stamp 2.000000000: a view with this stamp and frame was seen already."
+    )
+    (result,) = drain(scanner)
+    assert [(view.stamp_ns / SECOND, view.frame_id) for view in result.scan.views] == both
+
+
 def test_a_wrong_pair_is_rejected_under_the_name_of_the_image(
     messages: Any, circle_estimator: Callable[..., Any]
 ) -> None:
