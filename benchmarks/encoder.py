@@ -18,6 +18,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 import torch
+from tqdm import tqdm
 
 from relpose_ros.network.checkpoint import random_network
 from relpose_ros.network.features import ViewFeatures
@@ -55,7 +56,7 @@ def rows(name: str, repeats: int) -> None:
     images = torch.randn(MAX_VIEWS, 3, size, size, generator=generator)
     crops = torch.rand(MAX_VIEWS, 3, generator=generator)
     kept = [network.look(images[view : view + 1])[0] for view in range(MAX_VIEWS)]
-    for count in range(MIN_VIEWS, MAX_VIEWS + 1):
+    for count in tqdm(range(MIN_VIEWS, MAX_VIEWS + 1), desc=name, leave=False):
 
         def look(view: int) -> ViewFeatures:
             # One at a time, as the estimator does: a view's features must not depend on its company.
@@ -74,7 +75,8 @@ def rows(name: str, repeats: int) -> None:
             for call in (first, more, lambda: network.pair_contexts(features, list(i), list(j)))  # noqa: B023
         ]
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(f"{name:8} {count:2}  {'  '.join(columns)}  {peak:9.0f}", flush=True)
+        tqdm.write(f"{name:8} {count:2}  {'  '.join(columns)}  {peak:9.0f}")
+        sys.stdout.flush()
 
 
 def main() -> None:

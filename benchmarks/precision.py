@@ -4,19 +4,28 @@
 
 Everything is compared with float32 on the same inputs. The error of the energies is in standard deviations
 of a pair's energy over rotations, because that, and no constant, is what a pair's distribution is made of.
+
+Compilation runs in a process of its own and is given up after a while: on some machines it takes many minutes
+for the compact network, more than it could ever save on a robot.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import copy
+import os
 import platform
+import signal
+import subprocess
+import sys
 import warnings
 from itertools import combinations
 from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
+from tqdm import tqdm
 
 from benchmarks.encoder import timed, words
 from relpose_ros.geometry import so3_grid
@@ -28,6 +37,7 @@ if TYPE_CHECKING:
 
     from relpose_ros.network.relpose import RelPose
 
+EXACT, COMPILED = "float32", "torch.compile"
 VIEWS = 8
 ROTATIONS = 1024
 
@@ -83,18 +93,18 @@ def ways(network: RelPose) -> dict[str, Callable[[], Lowered]]:
         return Lowered(lowered)
 
     return {
-        "float32": lambda: Lowered(network),
+        EXACT: lambda: Lowered(network),
         "bfloat16 autocast": lambda: Lowered(network, autocast=True),
         "bfloat16": bfloat16,
         "int8 linear, dynamic": int8_linear,
         "int8 stored weights": int8_weights,
-        "torch.compile": compiled,
+        COMPILED: compiled,
     }
 
 
 @torch.no_grad()
-def compare(name: str, repeats: int) -> None:
-    """Prints one row for each way of one preset."""
+def compare(name: str, repeats: int, *, compiled: bool) -> None:
+    """Prints a row for each way to run a preset: the compiled one alone, or all others."""
     shipped = SHIPPED_WEIGHTS.is_file() and name == "compact"
     network = load_network() if shipped else random_network(name, 0)
     size = network.preset.image_size
@@ -106,18 +116,23 @@ def compare(name: str, repeats: int) -> None:
     ).float()
     i, j = (list(side) for side in zip(*combinations(range(VIEWS), 2), strict=True))
     exact_features = exact_energies = None
-    for way, make in ways(network).items():
+    every = {
+        way: make for way, make in ways(network).items() if way == EXACT or (way == COMPILED) == compiled
+    }
+    for way, make in tqdm(every.items(), desc=name, leave=False):
         label = f"{name:8} {way:21}"
         try:
             lowered = make()
             features = lowered.encode(images, crops)
             energies = lowered.energies(features, i, j, rotations)
         except Exception as err:  # a machine may lack a compiler or a kernel: that is the finding
-            print(f"{label} does not run here: {str(err).strip().splitlines()[0][:60]}", flush=True)
+            tqdm.write(f"{label} does not run here: {str(err).strip().splitlines()[0][:60]}")
             continue
         tokens = features.tokens.float()
         if exact_features is None or exact_energies is None:
             exact_features, exact_energies = tokens, energies
+        if way == EXACT and compiled:
+            continue
         feature_error = ((tokens - exact_features).norm() / exact_features.norm()).item()
         spread = exact_energies.std(-1, keepdim=True)
         difference = (energies - exact_energies) - (energies - exact_energies).mean(-1, keepdim=True)
@@ -125,10 +140,23 @@ def compare(name: str, repeats: int) -> None:
         same_best = (energies.argmax(-1) == exact_energies.argmax(-1)).float().mean().item()
         encode = words(timed(lambda: lowered.encode(images, crops), repeats))  # noqa: B023
         score = words(timed(lambda: lowered.energies(features, i, j, rotations), repeats))  # noqa: B023
-        print(
-            f"{label} {encode}  {score}  {feature_error:9.1e} {energy_error:9.1e} {same_best:9.0%}",
-            flush=True,
-        )
+        tqdm.write(f"{label} {encode}  {score}  {feature_error:9.1e} {energy_error:9.1e} {same_best:9.0%}")
+        sys.stdout.flush()
+
+
+def compare_compiled(name: str, repeats: int, threads: int, limit_s: float) -> None:
+    """Prints the row of the compiled network, or that compiling took too long."""
+    own = [sys.executable, "-m", "benchmarks.precision", "--presets", name, "--compiled-row"]
+    own += ["--threads", str(threads), "--repeats", str(repeats)]
+    # In a session of its own: the compiler starts processes, which must go with it.
+    with subprocess.Popen(own, start_new_session=True) as process:
+        try:
+            process.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            print(f"{name:8} {COMPILED:21} not done in {limit_s:.0f} s, given up", flush=True)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 def main() -> None:
@@ -136,15 +164,22 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--presets", nargs="+", choices=list(PRESETS), default=list(PRESETS))
+    parser.add_argument("--compile-limit", type=float, default=120, metavar="SECONDS", help="for compilation")
+    parser.add_argument("--compiled-row", action="store_true", help="that row alone, in this process")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")  # of deprecations in the ways compared
     torch.set_num_threads(arguments.threads)
+    if arguments.compiled_row:
+        for name in arguments.presets:
+            compare(name, arguments.repeats, compiled=True)
+        os._exit(0)  # without waiting for what the compiler leaves behind
     print(f"torch {torch.__version__}, {platform.machine()}, {arguments.threads} threads, N = {VIEWS};")
     print(f"least (median) seconds of {arguments.repeats} after one to warm up\n")
     times = f"{'encoder, s':>20}  {f'{ROTATIONS} rotations, s':>20}"
     print(f"{'preset':8} {'way':21} {times}  {'features':>9} {'energies':>9} same best", flush=True)
     for name in arguments.presets:
-        compare(name, arguments.repeats)
+        compare(name, arguments.repeats, compiled=False)
+        compare_compiled(name, arguments.repeats, arguments.threads, arguments.compile_limit)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ import copy
 import importlib.util
 import json
 import sys
-import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,38 +18,38 @@ from relpose_ros.inference.global_rotations import joint_scores, solve
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 from relpose_ros.network import conventions
+from relpose_ros.network.encoder import octaves
 from relpose_ros.network.presets import PRESETS
 from relpose_ros.network.relpose import RelPose
 
-HEAD = ("embed_feature", "embed_query", "layers.1", "layers.3", "layers.4")
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
-@pytest.fixture(scope="module")
-def references():
-    file = Path(__file__).resolve().parents[2] / "benchmarks" / "references.py"
-    spec = importlib.util.spec_from_file_location("references", file)
+def benchmark(name):
+    """A module of the benchmarks, which are no package that tests could import."""
+    spec = importlib.util.spec_from_file_location(name, BENCHMARKS / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules["references"] = module
+    sys.modules[name] = module
     spec.loader.exec_module(module)
     return module
 
 
 @pytest.fixture(scope="module")
+def references():
+    return benchmark("references")
+
+
+@pytest.fixture(scope="module")
 def peaked_head():
     """The published network's energy head by the golden recipe, made smooth and peaked; no other weights."""
+    recipes = benchmark("recipes")
     with torch.device("meta"):
         network = RelPose(PRESETS["paper"]).eval()
-    network.embedding = (2 ** torch.arange(8)).reshape(1, 1, -1)
-    with torch.no_grad():
-        for name in HEAD:
-            layer = network.get_submodule(name).to_empty(device="cpu")
-            for kind, parameter in layer.named_parameters():
-                generator = np.random.Generator(np.random.PCG64(zlib.crc32(f"{name}.{kind}".encode())))
-                values = generator.standard_normal(parameter.shape)
-                scale = np.sqrt(2 / parameter.shape[1]) if kind == "weight" else 0.1
-                parameter.copy_(torch.from_numpy((scale * values).astype(np.float32)))
-        network.embed_query.weight *= 2.0 ** -(torch.arange(144) % 8)
-        network.layers[4].weight *= 8
+    network.embedding = octaves(PRESETS["paper"].rotation_frequencies)[None, None]
+    for name in recipes.HEAD:
+        network.get_submodule(name).to_empty(device="cpu")
+    recipes.fill(network, recipes.HEAD)
+    recipes.peak(network)
     return network
 
 
