@@ -52,11 +52,9 @@ class AscentSettings:
     """Solutions that are refined, and"""
     reach: float = 0.25
     """nats a pair by which they may lie below the best one."""
-    radii: tuple[float, ...] = tuple(math.radians(a) for a in (12, 6, 3, 6, 4, 3))
+    radii: tuple[float, ...] = tuple(math.radians(a) for a in (12, 6, 3, 6, 4, 3, 2, 1))
     """Neighbourhood of each sweep over their cameras, rad; wider again once all have moved."""
-    last_radii: tuple[float, ...] = tuple(
-        math.radians(a) for a in (2, 1.5, 1, 1, 0.5, 0.5, 0.25, 0.25, 0.12, 0.06)
-    )
+    last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (2, 1.5, 1, 0.5, 0.25, 0.12, 0.06))
     """The same for the winner alone, at the end."""
     distinct: float = math.radians(10)
     """Solutions are different where some camera differs by more, rad."""
@@ -88,23 +86,29 @@ def solve(
 ) -> JointSolutions:
     """The joint maximum and the other local maxima that were met on the way."""
     count = settings.many(settings.starts, energies.count)
-    starts, scores = _climbed(energies, _grow(energies, distributions, 0, settings), count, settings)
-    refined = starts[:0]
+    jumping = settings.many(settings.jumpers, energies.count)
+    grown = _grow(energies, distributions, 0, settings)
+    starts, scores = _climbed(energies, grown, jumping, settings)
+    refined, rounds = starts[:0], 0
     if distributions.mode_energies[:, 0].sum() - scores[0] > settings.content * energies.count:
         # One beam favours what its first pairs agree on: each camera's turn as the root has another order.
         roots = range(1, energies.views)
-        grown = torch.cat([starts, *(_grow(energies, distributions, root, settings) for root in roots)])
+        more = [_grow(energies, distributions, root, settings) for root in roots]
         starts, _ = _climbed(energies, grown, count, settings)
-        jumpers = starts[: settings.many(settings.jumpers, energies.count)]
-        jumpers = torch.cat([_jump(energies, distributions, jumpers, settings), starts])
+        starts, _ = _climbed(energies, torch.cat([starts, *more]), count, settings)
+        jumped = torch.cat([_jump(energies, distributions, starts[:jumping], settings), starts])
         finalists = settings.many(settings.finalists, energies.count)
-        refined, scores = _best(energies, jumpers, finalists, settings.distinct)
+        refined, scores = _best(energies, jumped, finalists, settings.distinct)
         refined = refined[scores > scores[0] - settings.reach * energies.count]
         for radius in settings.radii:
             refined = _sweep(energies, refined, radius)
+        rounds = settings.many(1, energies.count) - 1
     # Jumps may all end on one hill: where they started is kept beside, for a runner-up to be told.
     rotations, _ = _best(energies, torch.cat([refined, starts]), count, settings.distinct)
     winner = rotations[:1]
+    for turn in range(rounds):  # where pairs are few, which costs little, ripples are searched more than once
+        for radius in settings.radii:
+            winner = _sweep(energies, winner, radius, turn + 1.0)
     for radius in settings.last_radii:
         winner = _sweep(energies, winner, radius)
     rotations, scores = _best(energies, torch.cat([winner, rotations[1:]]), count, settings.distinct)
@@ -323,10 +327,14 @@ def _remembered(
     return totals
 
 
-def _sweep(energies: PairEnergies, rotations: torch.Tensor, radius: float) -> torch.Tensor:
-    """Moves every camera in turn to the best place around it. (S, N, 3, 3) -> (S, N, 3, 3)."""
+def _sweep(energies: PairEnergies, rotations: torch.Tensor, radius: float, turn: float = 0.0) -> torch.Tensor:
+    """Moves every camera in turn to the best place around it. (S, N, 3, 3) -> (S, N, 3, 3).
+
+    Places lie at other directions for another ``turn``, rad.
+    """
     rotations = rotations.clone()
-    offsets = so3.exp_tensor(_NEIGHBOURHOOD * radius)  # the first is the identity: no camera gets worse
+    turned = _NEIGHBOURHOOD @ so3.exp_tensor(torch.tensor([turn, turn, 0.0], dtype=torch.float64))
+    offsets = so3.exp_tensor(turned * radius)  # the first is the identity: no camera gets worse
     rows = torch.arange(len(rotations))
     for camera in range(energies.views):
         others = [other for other in range(energies.views) if other != camera]
