@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,8 +39,10 @@ CHI_SQUARE_3 = (2.366, 6.251, 7.815)
 """Quantiles of the chi-square distribution with three degrees of freedom at those levels."""
 BINS = 10
 """Of predicted probability, for the expected calibration error."""
+FLAT_SHARES = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
+"""Shares of the uniform distribution that are tried."""
 TEMPERATURES = (1 / 32, 32.0)
-"""Range in which the temperature is looked for. The log-likelihood is concave in 1/T: it has one maximum."""
+"""Range in which the temperature is looked for. The log-likelihood of a share is concave in 1/T."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,9 @@ class Calibration:
     """Standard deviation of a predicted translation in the camera's axes, in units of the first camera's
     distance. The defaults are cautious: the object's place across the view is read off its box, its depth
     off the box's size alone."""
+    flat: float = 0.0
+    """Share of the uniform distribution that is mixed in: how often the network is plainly wrong of a pair,
+    as on photographs unlike its training images. Without it such a pair outvotes all that is known besides."""
 
     def to_json(self) -> str:
         """As kept in the weights' metadata, under ``calibration``."""
@@ -137,12 +142,22 @@ def observe(
     return Observation(energies, distributions, solutions, predicted, rotations, about_look_at, at_truth)
 
 
-def log_likelihood(observations: Sequence[Observation], temperature: float) -> float:
-    """Mean over all pairs of the log density of the truth relative to uniform, nats."""
+def log_likelihood(
+    observations: Sequence[Observation], temperature: float, flat: float | None = None
+) -> float:
+    """Mean over all pairs of the log density of the truth relative to uniform, nats.
+
+    Args:
+        observations: Held-out scans.
+        temperature: By which energies are divided.
+        flat: Share of the uniform distribution; None for the best of `FLAT_SHARES`.
+    """
     parts = [
         o.energy_at_truth / temperature - o.distributions.log_normaliser(temperature) for o in observations
     ]
-    return float(torch.cat(parts).mean())
+    densities = torch.cat(parts).exp()
+    shares = FLAT_SHARES if flat is None else (flat,)
+    return max(float(((1 - share) * densities + share).clamp_min(1e-30).log().mean()) for share in shares)
 
 
 def fit_calibration(observations: Sequence[Observation]) -> Calibration:
@@ -151,11 +166,10 @@ def fit_calibration(observations: Sequence[Observation]) -> Calibration:
     A factor is kept only where it brings the coverages at 50, 90 and 95% nearer to their names.
     """
     temperature = _maximise(lambda t: log_likelihood(observations, t), *TEMPERATURES)
-    calibration = Calibration(temperature, translation_sigma=_translation_sigma(observations))
+    flat = max(FLAT_SHARES, key=lambda share: log_likelihood(observations, temperature, share))
+    calibration = Calibration(temperature, translation_sigma=_translation_sigma(observations), flat=flat)
     pair_squares, rotation_squares, _ = _mahalanobis_squares(observations, calibration)
-    return Calibration(
-        temperature, _spread(pair_squares), _spread(rotation_squares), calibration.translation_sigma
-    )
+    return replace(calibration, pair_spread=_spread(pair_squares), rotation_spread=_spread(rotation_squares))
 
 
 def measure_calibration(observations: Sequence[Observation], calibration: Calibration) -> CalibrationReport:
@@ -168,7 +182,7 @@ def measure_calibration(observations: Sequence[Observation], calibration: Calibr
     pair_squares, rotation_squares, position_squares = _mahalanobis_squares(observations, calibration)
     return CalibrationReport(
         pairs=len(stated),
-        log_likelihood=log_likelihood(observations, calibration.temperature),
+        log_likelihood=log_likelihood(observations, calibration.temperature, calibration.flat),
         expected_calibration_error=expected_calibration_error(np.array(stated), np.array(right)),
         pair_coverage=_coverage(pair_squares),
         camera_rotation_coverage=_coverage(rotation_squares),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -13,10 +15,14 @@ import torch
 from relpose_ros.errors import RelPoseError
 from relpose_ros.estimates import CameraPose, ScanEstimate
 from relpose_ros.geometry import cameras
+from relpose_ros.inference import bundle_adjustment
 from relpose_ros.inference.calibration import Calibration
-from relpose_ros.inference.global_rotations import solve
+from relpose_ros.inference.camera_positions import baseline, place
+from relpose_ros.inference.global_rotations import joint_scores, solve
+from relpose_ros.inference.matches import Matcher, peaks
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
+from relpose_ros.inference.rotation_evidence import RotationEvidence
 from relpose_ros.inference.uncertainty import camera_covariances, describe_pairs
 from relpose_ros.inference.verdict import judge
 from relpose_ros.network.checkpoint import load_network, read_metadata
@@ -29,7 +35,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from relpose_ros.inference.global_rotations import JointSolutions
+    from relpose_ros.inference.matches import TwoViewGeometry
     from relpose_ros.inference.pair_distribution import PairDistributions
     from relpose_ros.network.features import SceneFeatures
     from relpose_ros.network.relpose import RelPose
@@ -42,6 +48,37 @@ class ScanError(RelPoseError):
     """A scan that nothing can be said about."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What a scan's pairs say, each by itself."""
+
+    features: SceneFeatures
+    geometries: dict[tuple[int, int], TwoViewGeometry]
+    energies: PairEnergies
+    distributions: PairDistributions
+    calibration: Calibration
+    """Of the sum of energies, which are log-densities as they are."""
+
+
+CONTRADICTION = 0.5
+"""Nats a pair: refined poses that lose more of the joint energy contradict the pairs, and are not taken."""
+
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """What an estimate rests on beside the network's energies."""
+
+    use: Literal["off", "pairs", "refine"] = "refine"
+    """``pairs``: matched local features join the pairs' energies and the camera positions. ``refine``: then a
+    bundle adjustment where three or more views share points."""
+    surroundings: bool = False
+    """Whether features outside the object's box and mask take part."""
+    learned: bool = True
+    """Whether the network's rotations take part: False measures what the geometry alone can do."""
+    first_view_distance: float = 0.0
+    """Metres from the first camera to the object frame's origin; 0: not known, and neither is the scale."""
+
+
 class Estimator:
     """Estimates the camera poses of a scan.
 
@@ -50,26 +87,40 @@ class Estimator:
     Safe to call from several threads; one estimate is made at a time.
     """
 
-    def __init__(self, network: RelPose, calibration: Calibration | None = None) -> None:
+    def __init__(
+        self,
+        network: RelPose,
+        calibration: Calibration | None = None,
+        evidence: EvidenceSettings = EvidenceSettings(),
+    ) -> None:
         """Takes the network as it is.
 
         Args:
             network: with its weights; they must not change afterwards.
             calibration: of those weights; None says that nobody calibrated them.
+            evidence: what else to rest on.
         """
         self._network = network.eval()
         self._calibration = calibration
+        self._evidence = evidence
+        self._matcher = None if evidence.use == "off" else Matcher(surroundings=evidence.surroundings)
         self._grid = GridEmbeddings(network)
         self._looks: WeakKeyDictionary[View, tuple[ViewFeatures, torch.Tensor]] = WeakKeyDictionary()
         self._lock = threading.Lock()
 
     @classmethod
-    def from_weights(cls, path: Path | None = None, threads: int | None = None) -> Estimator:
+    def from_weights(
+        cls,
+        path: Path | None = None,
+        threads: int | None = None,
+        evidence: EvidenceSettings = EvidenceSettings(),
+    ) -> Estimator:
         """Loads weights and their calibration.
 
         Args:
             path: of a weights file; None for the shipped compact weights.
             threads: for torch, of the whole process; None or 0 leaves torch's own choice.
+            evidence: what else than the network to rest on.
 
         Raises:
             NetworkFileError: if the file is missing or is none of ours.
@@ -78,7 +129,7 @@ class Estimator:
             torch.set_num_threads(threads)
         network = load_network(path)
         stored = read_metadata(path).get("calibration")
-        return cls(network, Calibration.from_json(stored) if stored else None)
+        return cls(network, Calibration.from_json(stored) if stored else None, evidence)
 
     @torch.no_grad()
     def estimate(self, scan: Scan) -> ScanEstimate:
@@ -94,27 +145,32 @@ class Estimator:
             )
         with self._lock:
             start = time.perf_counter()
-            features = self._features(scan)
-            energies, distributions, solutions = self._solve(features)
-            calibration = self._calibration or Calibration()
-            translations = self._network.optical_translations(features).double().numpy()
-            unit = max(float(np.linalg.norm(translations[0])), 1e-6)
-            translations = translations / unit
+            found = self._search(scan)
+            solutions = solve(found.energies, found.distributions)
             solution = solutions.rotations[0]
-            rotations = solution.numpy()
-            centres = cameras.camera_centre(rotations, translations)
-            covariances = camera_covariances(distributions, energies, solution, translations, calibration)
-            pairs = describe_pairs(distributions, energies, solution, calibration)
+            translations = self._network.optical_translations(found.features).double().numpy()
+            translations = translations / max(float(np.linalg.norm(translations[0])), 1e-6)
+            covariances = camera_covariances(
+                found.distributions, found.energies, solution, translations, found.calibration
+            )
+            rotations, centres, covariances = self._place(
+                scan, found, solution.numpy(), translations, covariances
+            )
+            solution = torch.from_numpy(rotations)
+            unit = self._evidence.first_view_distance or 1.0
+            covariances[:, :3] *= unit
+            covariances[:, :, :3] *= unit
+            pairs = describe_pairs(found.distributions, found.energies, solution, found.calibration)
             verdict, weakest, status = judge(pairs, covariances, self._calibration is not None)
             return ScanEstimate(
                 object_id=scan.object_id,
                 cameras=tuple(
-                    CameraPose(view, rotations[view].T, centres[view], covariances[view])
+                    CameraPose(view, rotations[view].T, unit * centres[view], covariances[view])
                     for view in range(len(scan.views))
                 ),
                 pairs=pairs,
-                score=float(solutions.scores[0]),
-                scale_known=False,
+                score=float(joint_scores(found.energies, solution[None])[0]),
+                scale_known=self._evidence.first_view_distance > 0,
                 calibrated=self._calibration is not None,
                 verdict=verdict,
                 weakest_pair=weakest,
@@ -123,15 +179,81 @@ class Estimator:
             )
 
     @torch.no_grad()
+    def pair_masses(self, scan: Scan) -> list[tuple[FloatArray, FloatArray]]:
+        """Each pair's whole distribution, to be looked at: cell centres (L, 3, 3) and probabilities (L,).
+
+        Pairs i < j, ordered by i, then j; rotations are camera_j_from_camera_i.
+        """
+        with self._lock:
+            distributions = self._search(scan).distributions
+            return [
+                (rotations.numpy(), masses.numpy())
+                for rotations, masses in zip(distributions.rotations, distributions.masses(), strict=True)
+            ]
+
+    @torch.no_grad()
     def rotations(self, features: SceneFeatures) -> FloatArray:
         """The jointly best rotations, camera_from_object, the first the identity. -> (N, 3, 3)."""
-        _, _, solutions = self._solve(features)
-        return np.asarray(solutions.rotations[0].numpy())
-
-    def _solve(self, features: SceneFeatures) -> tuple[PairEnergies, PairDistributions, JointSolutions]:
         energies = PairEnergies.of(self._network, features, len(features))
-        distributions = search(energies, self._grid)
-        return energies, distributions, solve(energies, distributions)
+        return np.asarray(solve(energies, search(energies, self._grid)).rotations[0].numpy())
+
+    def _search(self, scan: Scan) -> _Found:
+        """Everything that is known of the pairs before their rotations are brought together."""
+        features = self._features(scan)
+        calibration = self._calibration or Calibration()
+        geometries = {} if self._matcher is None else self._matcher.geometries(scan.views)
+        # The temperature belongs to the network's energies, not to what is added to them.
+        temperature = calibration.temperature if self._evidence.learned else math.inf
+        energies = PairEnergies.of(
+            self._network,
+            features,
+            len(features),
+            temperature,
+            RotationEvidence([peaks(each) for each in geometries.values()]) if geometries else None,
+        )
+        if calibration.flat > 0:
+            energies = energies.mixed(self._grid, calibration.flat)
+        return _Found(
+            features,
+            geometries,
+            energies,
+            search(energies, self._grid),
+            replace(calibration, temperature=1.0, flat=0.0),
+        )
+
+    def _place(
+        self,
+        scan: Scan,
+        found: _Found,
+        rotations: FloatArray,
+        translations: FloatArray,
+        covariances: FloatArray,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Rotations, camera centres and covariances with what the matches say of positions."""
+        centres = cameras.camera_centre(rotations, translations)
+        baselines = []
+        for (i, j), geometry in found.geometries.items():
+            if geometry.agrees(rotations[j] @ rotations[i].T):
+                pose, turn = geometry.poses[0], covariances[j, 3:, 3:]
+                baselines.append(
+                    baseline(i, j, rotations[j], pose.direction, pose.direction_covariance, turn)
+                )
+        centres, covariances = place(centres, covariances, baselines)
+        if self._matcher is None or self._evidence.use != "refine":
+            return rotations, centres, covariances
+        refined = bundle_adjustment.refine(
+            rotations,
+            cameras.translation_of(rotations, centres),
+            [self._matcher.features(view) for view in scan.views],
+            found.geometries,
+        )
+        if refined is None:
+            return rotations, centres, covariances
+        both = torch.from_numpy(np.stack([rotations, refined.rotations]))
+        before, after = joint_scores(found.energies, both).tolist()
+        if after < before - CONTRADICTION * found.energies.count:
+            return rotations, centres, covariances
+        return refined.rotations, cameras.camera_centre(refined.rotations, refined.translations), covariances
 
     def _features(self, scan: Scan) -> SceneFeatures:
         looks = []

@@ -67,9 +67,10 @@ class PairDistributions:
         """Log of the mean of exp(energy / temperature) over SO(3). -> (P,)."""
         return torch.logsumexp(self.energies / temperature + self.log_volumes, -1)
 
-    def masses(self, temperature: float = 1.0) -> torch.Tensor:
-        """Probability of each cell; every row sums to one. -> (P, L)."""
-        return torch.softmax(self.energies / temperature + self.log_volumes, -1)
+    def masses(self, temperature: float = 1.0, flat: float = 0.0) -> torch.Tensor:
+        """Probability of each cell, a share ``flat`` of it uniform; every row sums to one. -> (P, L)."""
+        masses = torch.softmax(self.energies / temperature + self.log_volumes, -1)
+        return masses if flat == 0 else (1 - flat) * masses + flat * self.log_volumes.exp()
 
     @cached_property
     def mode_log_densities(self) -> torch.Tensor:
@@ -83,7 +84,7 @@ def search(
     """Evaluates every pair coarse to fine and refines its modes."""
     level = settings.level
     cells = torch.arange(so3_grid.size(level)).expand(energies.count, -1)
-    values = energies.on_grid(grid(level))
+    values = energies.on_level(grid, level)
     coarse = values.double()
     ancestors = cells
     kept: list[tuple[int, torch.Tensor, torch.Tensor]] = []

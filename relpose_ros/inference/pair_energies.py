@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -18,6 +19,10 @@ from relpose_ros.geometry import so3_grid
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from relpose_ros.inference.rotation_evidence import RotationEvidence
+
+COARSE_LEVEL = 1
+"""Cells of 30 degrees."""
 LAST_KEPT_LEVEL = 2
 """Whole levels are kept up to this one: 5 MB at the published size. The next would be 38 MB, of which a scan
 looks at a few per cent."""
@@ -80,12 +85,27 @@ class PairEnergies:
     """(P,) int64."""
     views: int
     """N."""
+    temperature: float = 1.0
+    """The network's energies are divided by it; infinity silences the network."""
+    evidence: RotationEvidence | None = None
+    """Added to the network's energies where there is some."""
+    log_share: torch.Tensor | None = None
+    """(P,) what makes them a mixture, see `mixed`; None: they are taken as they are."""
+    flat: float = 0.0
+    """Share of the uniform distribution in that mixture."""
 
     @classmethod
-    def of(cls, model: EnergyModel, features: Any, views: int) -> PairEnergies:
+    def of(
+        cls,
+        model: EnergyModel,
+        features: Any,
+        views: int,
+        temperature: float = 1.0,
+        evidence: RotationEvidence | None = None,
+    ) -> PairEnergies:
         """Computes the contexts of all pairs of a scan."""
         i, j = torch.triu_indices(views, views, 1).unbind(0)
-        return cls(model, model.pair_contexts(features, i, j), i, j, views)
+        return cls(model, model.pair_contexts(features, i, j), i, j, views, temperature, evidence)
 
     @property
     def count(self) -> int:
@@ -110,13 +130,41 @@ class PairEnergies:
                 )[0]
         return energies
 
+    def mixed(self, grid: GridEmbeddings, flat: float) -> PairEnergies:
+        """Log-densities relative to uniform of a mixture: the network's distribution and the uniform one.
+
+        A network that is plainly wrong about some pairs must not rule anything out by itself. The coarse
+        level is enough to normalise its smooth energies.
+
+        Args:
+            grid: the embeddings of the rotation grid.
+            flat: share of the uniform distribution, 0 < flat < 1.
+        """
+        energies = self.on_grid(grid(COARSE_LEVEL)) / self.temperature
+        log_normalisers = torch.logsumexp(energies, -1) - math.log(energies.shape[-1])
+        return replace(self, log_share=math.log1p(-flat) - log_normalisers, flat=flat)
+
+    def on_level(self, grid: GridEmbeddings, level: int) -> torch.Tensor:
+        """Energies of every pair on a whole level. -> (P, 72 * 8^level)."""
+        learned = self._calibrated(self.on_grid(grid(level)), slice(None))
+        if self.evidence is None:
+            return learned
+        rotations = torch.from_numpy(np.array(so3_grid.grid(level)))
+        blur = so3_grid.cell_spacing(level) / 2
+        return learned + self.evidence(torch.arange(self.count), rotations, blur).to(learned.dtype)
+
     def on_cells(self, grid: GridEmbeddings, level: int, cells: torch.Tensor) -> torch.Tensor:
         """Energies of every pair at its own cells of a level. (P, C) int64 -> (P, C)."""
         parts = [
             self.model.pair_energies(self.contexts[part], grid.of_cells(level, cells[part]))
             for part in _blocks(*cells.shape)
         ]
-        return torch.cat(parts)
+        learned = self._calibrated(torch.cat(parts), slice(None))
+        if self.evidence is None:
+            return learned
+        rotations = torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
+        blur = so3_grid.cell_spacing(level) / 2
+        return learned + self.evidence(torch.arange(self.count), rotations, blur).to(learned.dtype)
 
     def at(self, pairs: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
         """Energies at any rotations; differentiable. (Q,) int64 pairs, (Q, K, 3, 3) -> (Q, K)."""
@@ -126,7 +174,18 @@ class PairEnergies:
             )
             for part in _blocks(*rotations.shape[:2])
         ]
-        return parts[0] if len(parts) == 1 else torch.cat(parts)
+        learned = self._calibrated(parts[0] if len(parts) == 1 else torch.cat(parts), pairs)
+        if self.evidence is None:
+            return learned
+        return learned + self.evidence(pairs, rotations)
+
+    def _calibrated(self, energies: torch.Tensor, pairs: torch.Tensor | slice) -> torch.Tensor:
+        """From the network's energies (Q, K) of some pairs to log-likelihoods."""
+        energies = energies / self.temperature
+        if self.log_share is None:
+            return energies
+        uniform = torch.tensor(math.log(self.flat), dtype=energies.dtype)
+        return torch.logaddexp(energies + self.log_share[pairs, None], uniform)
 
 
 def _blocks(rows: int, columns: int) -> Iterator[slice]:

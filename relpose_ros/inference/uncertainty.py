@@ -48,7 +48,7 @@ def describe_pairs(
         calibration: of the network.
     """
     solved = solution[energies.j] @ solution[energies.i].mT
-    masses = distributions.masses(calibration.temperature)
+    masses = distributions.masses(calibration.temperature, calibration.flat)
     entropies = -(masses * (masses.clamp_min(1e-300).log() - distributions.log_volumes)).sum(1)
     pairs = []
     for pair in range(energies.count):
@@ -88,10 +88,16 @@ def describe_pairs(
                 ambiguity_angle=_angle(modes[0], modes[1]) if ambiguous else 0.0,
                 solution_probability=_share(to_solution, mass, distributions.spacings),
                 solution_angle=float(_angles(solved[pair : pair + 1], centres).min()),
-                evidence=Evidence.LEARNED,
+                evidence=_evidence(energies, pair),
             )
         )
     return tuple(pairs)
+
+
+def _evidence(energies: PairEnergies, pair: int) -> Evidence:
+    learned = Evidence.LEARNED if energies.temperature < math.inf else Evidence(0)
+    spoken = energies.evidence is not None and energies.evidence.spoken[pair]
+    return learned | Evidence.GEOMETRIC if spoken else learned
 
 
 def _angle(a: Mode, b: Mode) -> float:
@@ -192,7 +198,7 @@ def _joint_spread(
     is divided by N / 2, which is exact where each view has one error of its own.
     """
     relative = solution[energies.j] @ solution[energies.i].mT
-    masses = distributions.masses(calibration.temperature)
+    masses = distributions.masses(calibration.temperature, calibration.flat)
     information = np.zeros((3 * energies.views, 3 * energies.views))
     for pair, (i, j) in enumerate(zip(energies.i.tolist(), energies.j.tolist(), strict=True)):
         moment = _second_moment(distributions, pair, relative[pair], masses[pair])
