@@ -39,7 +39,8 @@ from tqdm import tqdm
 from benchmarks import recipes
 from benchmarks.encoder import timed
 from benchmarks.references import best_of_pair, exhaustive, published, published_evaluations
-from relpose_ros.inference.estimator import Estimator, EvidenceSettings
+from relpose_ros.inference.estimator import Estimator
+from relpose_ros.inference.evidence import EvidenceSettings
 from relpose_ros.inference.global_rotations import solve
 from relpose_ros.inference.pair_distribution import SearchSettings, search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies

@@ -44,13 +44,12 @@ class Method(Protocol):
         ...
 
 
-class Learned:
+class Estimated:
     """The estimator of this package."""
 
-    name = "relpose"
-
-    def __init__(self, estimator: Estimator) -> None:
+    def __init__(self, name: str, estimator: Estimator) -> None:
         """Wrap an estimator, whose feature cache makes prefixes of a scan cheap."""
+        self.name = name
         self._estimator = estimator
         self._last: tuple[tuple[View, ...], Poses] | None = None
 

@@ -13,6 +13,7 @@ import numpy as np
 from relpose_ros.errors import RelPoseError
 from relpose_ros.evaluation import baselines, metrics
 from relpose_ros.geometry.cameras import camera_centre
+from relpose_ros.inference.evidence import EvidenceSettings
 from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
 
 if TYPE_CHECKING:
@@ -29,7 +30,16 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 """One line of the result: capture, method, views, scans, the figures of `metrics.summary`, seconds."""
 
-METHODS = ("relpose", "constant-translation", "identity", "colmap")
+METHODS = ("relpose", "both", "learned", "geometry", "constant-translation", "identity", "colmap")
+"""relpose is the estimator as it ships: the network, matches and refinement. both leaves out the refinement,
+learned the matches too, geometry the network."""
+EVIDENCE = {
+    "relpose": EvidenceSettings("refine"),
+    "both": EvidenceSettings("pairs"),
+    "learned": EvidenceSettings("off"),
+    "geometry": EvidenceSettings("pairs", learned=False),
+}
+"""What the estimator rests on in each of these methods."""
 ORDERS = 5
 """Random orders a capture, as in the paper."""
 MEAN = "mean"
@@ -256,16 +266,18 @@ def _methods(
         text = f"{unknown[0]!r} is no method; choose among {', '.join(METHODS)}."
         raise EvaluationError(text)
     chosen: list[baselines.Method] = []
-    learned: baselines.Learned | None = None
+    estimating: dict[str, baselines.Estimated] = {}
     for name in names:
-        if name in ("relpose", "constant-translation") and learned is None:
+        of = "learned" if name == "constant-translation" else name
+        if of in EVIDENCE and of not in estimating:
             from relpose_ros.inference.estimator import Estimator
 
-            learned = baselines.Learned(Estimator.from_weights(weights, threads))
-        if name == "relpose" and learned is not None:
-            chosen.append(learned)
-        elif name == "constant-translation" and learned is not None:
-            chosen.append(baselines.ConstantTranslation(learned))
+            estimator = Estimator.from_weights(weights, threads, EVIDENCE[of])
+            estimating[of] = baselines.Estimated(of, estimator)
+        if name in EVIDENCE:
+            chosen.append(estimating[name])
+        elif name == "constant-translation":
+            chosen.append(baselines.ConstantTranslation(estimating["learned"]))
         elif name == "identity":
             chosen.append(baselines.Identity())
         elif name == "colmap":

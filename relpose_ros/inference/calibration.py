@@ -61,7 +61,7 @@ class Calibration:
     off the box's size alone."""
     flat: float = 0.0
     """Share of the uniform distribution that is mixed in: how often the network is plainly wrong of a pair,
-    as on photographs unlike its training images. Without it such a pair outvotes all that is known besides."""
+    as on photographs unlike its training images. Without it such a pair outvotes all else that is known."""
 
     def to_json(self) -> str:
         """As kept in the weights' metadata, under ``calibration``."""

@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -18,6 +18,7 @@ from relpose_ros.geometry import cameras
 from relpose_ros.inference import bundle_adjustment
 from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.camera_positions import baseline, place
+from relpose_ros.inference.evidence import SHIPPED, EvidenceSettings
 from relpose_ros.inference.global_rotations import joint_scores, solve
 from relpose_ros.inference.matches import Matcher, peaks
 from relpose_ros.inference.pair_distribution import search
@@ -64,21 +65,6 @@ CONTRADICTION = 0.5
 """Nats a pair: refined poses that lose more of the joint energy contradict the pairs, and are not taken."""
 
 
-@dataclass(frozen=True)
-class EvidenceSettings:
-    """What an estimate rests on beside the network's energies."""
-
-    use: Literal["off", "pairs", "refine"] = "refine"
-    """``pairs``: matched local features join the pairs' energies and the camera positions. ``refine``: then a
-    bundle adjustment where three or more views share points."""
-    surroundings: bool = False
-    """Whether features outside the object's box and mask take part."""
-    learned: bool = True
-    """Whether the network's rotations take part: False measures what the geometry alone can do."""
-    first_view_distance: float = 0.0
-    """Metres from the first camera to the object frame's origin; 0: not known, and neither is the scale."""
-
-
 class Estimator:
     """Estimates the camera poses of a scan.
 
@@ -91,7 +77,7 @@ class Estimator:
         self,
         network: RelPose,
         calibration: Calibration | None = None,
-        evidence: EvidenceSettings = EvidenceSettings(),
+        evidence: EvidenceSettings = SHIPPED,
     ) -> None:
         """Takes the network as it is.
 
@@ -113,7 +99,7 @@ class Estimator:
         cls,
         path: Path | None = None,
         threads: int | None = None,
-        evidence: EvidenceSettings = EvidenceSettings(),
+        evidence: EvidenceSettings = SHIPPED,
     ) -> Estimator:
         """Loads weights and their calibration.
 

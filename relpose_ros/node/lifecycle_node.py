@@ -252,7 +252,7 @@ class ScanNode(LifecycleNode):
         # Imported here, as is all that needs PyTorch: that takes seconds, in which a signal must be heard.
         from relpose_ros.inference.estimator import Estimator
 
-        return Estimator.from_weights(weights, threads or None)
+        return Estimator.from_weights(weights, threads or None, self._settings.evidence_settings)
 
     def _make_outputs(self) -> None:
         for name, message_type in OUTPUTS:

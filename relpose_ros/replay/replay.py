@@ -146,7 +146,8 @@ def replay(
 def _learned_estimator(weights: Path | None, settings: ScanSettings) -> SupportsEstimate:
     from relpose_ros.inference.estimator import Estimator
 
-    return Estimator.from_weights(weights or settings.weights_path, settings.threads or None)
+    chosen = weights or settings.weights_path
+    return Estimator.from_weights(chosen, settings.threads or None, settings.evidence_settings)
 
 
 def _cells(

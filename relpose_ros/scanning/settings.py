@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import yaml
 
 from relpose_ros.errors import RelPoseError
+from relpose_ros.inference.evidence import EvidenceSettings
 from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
 
 if TYPE_CHECKING:
@@ -105,6 +106,24 @@ class ScanSettings:
         "Path of a weights file, where ~ is the home folder; empty: the compact weights that ship with the "
         "package.",
     )
+    evidence: str = _setting(
+        "refine",
+        "What joins the network. off: nothing. pairs: local features that match between two views speak for "
+        "the pair's rotation and for the direction between the cameras. refine: where views share such "
+        "points, a bundle adjustment then makes the poses exact. Matching costs a third of a second a view.",
+        choices=("off", "pairs", "refine"),
+    )
+    surroundings: bool = _setting(
+        False,
+        "Whether features outside the object's box and mask may match too. A static table helps a camera "
+        "that moves around it; where the object is what turns, the table says that nothing moved.",
+    )
+    first_view_distance: float = _setting(
+        0.0,
+        "Distance in metres from the first camera to the object, for positions in metres; 0: not known, and "
+        "the distance is the unit of length.",
+        limits=(0.0, 1000.0),
+    )
     threads: int = _setting(
         0,
         "Threads of the network on the CPU; 0: as many as PyTorch takes by itself. Fewer leave cores to "
@@ -134,6 +153,15 @@ class ScanSettings:
                 raise SettingsError(text)
         if not self.image_transports:
             raise SettingsError("image_transports is empty: name raw, compressed or both.")
+
+    @property
+    def evidence_settings(self) -> EvidenceSettings:
+        """What an estimator needs to know of these settings."""
+        return EvidenceSettings(
+            use=cast("Any", self.evidence),
+            surroundings=self.surroundings,
+            first_view_distance=self.first_view_distance,
+        )
 
     @property
     def weights_path(self) -> Path | None:

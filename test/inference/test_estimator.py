@@ -153,7 +153,8 @@ def test_weights_bring_their_calibration(network, tmp_path):
     assert calibrated.calibrated
     assert not plain.calibrated
     assert calibrated.pairs[0].entropy > plain.pairs[0].entropy
-    assert numbers(calibrated)[0] == numbers(plain)[0]
+    both = [each.cameras[1].object_from_camera for each in (calibrated, plain)]
+    assert so3.angle_between(*both) < np.radians(0.5), "a temperature moves no maximum"
 
 
 def test_rotations_of_features(network):
