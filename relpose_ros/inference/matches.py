@@ -38,6 +38,8 @@ CONTRAST = 0.01
 """A quarter of Lowe's: plain objects have few features of any contrast, and a bad one costs little."""
 RATIO = 0.85
 """Largest distance of a match relative to the second best (Lowe 2004), on root-normalised descriptors."""
+ROUNDING = 1e-5
+"""Of a squared distance of descriptors."""
 THRESHOLD = 1.5
 """Of an inlier, in pixels of the picture in which the features were found."""
 LEAST_MATCHES = 8
@@ -146,7 +148,9 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
     # OpenCV's (0, 0) is the first pixel's centre.
     pixels = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5
-    pixels = pixels / scale + [left + view.origin[0], top + view.origin[1]]
+    # Sizes are whole: the sides may have been scaled a little differently.
+    pixels *= [picture.shape[1] / grey.shape[1], picture.shape[0] / grey.shape[0]]
+    pixels += [left + view.origin[0], top + view.origin[1]]
     focal = np.array([intrinsics.fx, intrinsics.fy])
     rays = (pixels - [intrinsics.cx, intrinsics.cy]) / focal
     return LocalFeatures(rays, descriptors, 1 / (scale * float(focal.mean())), guessed)
@@ -162,8 +166,8 @@ def match(first: LocalFeatures, second: LocalFeatures) -> IntArray:
     mutual = likeness.argmax(0)[best] == rows
     highest = likeness[rows, best]
     likeness[rows, best] = -1
-    # Squared distances of unit vectors.
-    apart = 2 - 2 * highest < RATIO**2 * (2 - 2 * likeness.max(1))
+    # Squared distances of unit vectors, to rounding: of two that look the same, none is the nearer.
+    apart = 2 - 2 * highest + ROUNDING < RATIO**2 * (2 - 2 * likeness.max(1))
     chosen = rows[mutual & apart]
     return np.stack([chosen, best[chosen]], 1)
 
@@ -209,10 +213,12 @@ def _part(view: View, surroundings: bool) -> tuple[int, int, npt.NDArray[np.uint
     if surroundings:
         return 0, 0, view.image
     x, y = view.origin
-    left, right = (min(max(round(edge - x), 0), width) for edge in (view.box.x0, view.box.x1))
-    top, bottom = (min(max(round(edge - y), 0), height) for edge in (view.box.y0, view.box.y1))
-    if right - left < 2 or bottom - top < 2:
-        return 0, 0, view.image
+    left, top = (
+        min(max(round(view.box.x0 - x), 0), width - 1),
+        min(max(round(view.box.y0 - y), 0), height - 1),
+    )
+    # One pixel at least, which has no features, as a box outside the image has none.
+    right, bottom = max(round(view.box.x1 - x), left + 1), max(round(view.box.y1 - y), top + 1)
     return left, top, view.image[top:bottom, left:right]
 
 

@@ -1,0 +1,402 @@
+from __future__ import annotations
+
+import gc
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from relpose_ros.captures.folder import load_capture
+from relpose_ros.geometry import so3
+from relpose_ros.inference import matches
+from relpose_ros.inference.matches import (
+    LEAST_MATCHES,
+    NOTHING,
+    LocalFeatures,
+    Matcher,
+    RelativePose,
+    TwoViewGeometry,
+    find_features,
+    match,
+    peaks,
+    relate,
+    trust,
+)
+from relpose_ros.views import BoundingBox, Intrinsics, View
+
+
+def degrees(a, b):
+    return math.degrees(so3.angle_between(a, b))
+
+
+def between(a, b):
+    """Angle of two vectors, degrees."""
+    return math.degrees(math.atan2(np.linalg.norm(np.cross(a, b)), a @ b))
+
+
+def textured(seed, height=160, width=200, **changes):
+    noise = np.random.default_rng(seed).standard_normal((height, width))
+    grey = np.clip(128 + 500 * cv2.GaussianBlur(noise, (0, 0), 2.5), 0, 255).astype(np.uint8)
+    image = np.repeat(grey[..., None], 3, -1)
+    view = View(image, BoundingBox(0, 0, width, height), width, height)
+    return replace(view, **changes) if changes else view
+
+
+def pixels(features, view):
+    """Where features are, in the full image."""
+    intrinsics, _ = matches._intrinsics(view)
+    return features.rays * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
+
+
+# What two views of known points say.
+
+
+@pytest.mark.parametrize("angle", [8, 25, 60])
+def test_pose_of_two_views_despite_outliers(point_scene, angle):
+    scene = point_scene.ring([0, angle], points=200)
+    first, second = scene.features(outliers=60)
+    found = relate(first, second)
+    rotation, direction = scene.relative(0, 1)
+    assert degrees(found.poses[0].rotation, rotation) < 0.6
+    assert between(found.poses[0].direction, direction) < 3
+    assert found.probability > 0.95
+    assert sum(pose.weight for pose in found.poses) == pytest.approx(1)
+    # Inliers are those that obey the pose: nearly all true matches, hardly an outlier.
+    same = (first.descriptors[found.inliers[:, 0]] == second.descriptors[found.inliers[:, 1]]).all(1)
+    assert same.all()
+    assert 130 <= len(found.inliers) <= 152
+
+
+def test_exact_points_give_the_exact_pose(point_scene):
+    scene = point_scene.ring([0, 30])
+    found = relate(*scene.features(noise=0))
+    rotation, direction = scene.relative(0, 1)
+    assert degrees(found.poses[0].rotation, rotation) < 1e-3
+    assert between(found.poses[0].direction, direction) < 1e-3
+
+
+def test_swapping_the_views_inverts_the_pose(point_scene):
+    first, second = point_scene.ring([0, 25]).features(noise=0.3)
+    there, back = relate(first, second).poses[0], relate(second, first).poses[0]
+    assert degrees(there.rotation, back.rotation.T) < 0.2
+    assert between(there.direction, -there.rotation @ back.direction) < 1
+
+
+def test_same_bits_twice(point_scene):
+    features = point_scene.ring([0, 25]).features(outliers=80)
+    first, second = relate(*features), relate(*features)
+    assert first.inliers.tobytes() == second.inliers.tobytes()
+    assert first.probability == second.probability
+    for a, b in zip(first.poses, second.poses, strict=True):
+        for name in ("rotation", "direction", "covariance", "direction_covariance"):
+            assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
+
+
+def test_more_points_say_it_more_exactly(point_scene):
+    few = relate(*point_scene.ring([0, 25], points=40).features()).poses[0]
+    many = relate(*point_scene.ring([0, 25], points=640).features()).poses[0]
+    ratio = np.trace(few.covariance) / np.trace(many.covariance)
+    assert 5 < ratio < 60  # 16 times the points
+    assert np.trace(few.direction_covariance) > 4 * np.trace(many.direction_covariance)
+
+
+def test_stated_covariances_are_those_of_the_errors(point_scene):
+    """Over many draws: squared Mahalanobis distances of rotation and direction, 3 and 2 on average."""
+    of_rotation, of_direction = [], []
+    for seed in range(40):
+        scene = point_scene.ring([0, 25], points=120, seed=seed)
+        pose = relate(*scene.features(noise=0.7, seed=seed)).poses[0]
+        rotation, direction = scene.relative(0, 1)
+        turn = so3.log(rotation @ pose.rotation.T)
+        of_rotation.append(turn @ np.linalg.solve(pose.covariance, turn))
+        shift = direction - pose.direction
+        of_direction.append(shift @ np.linalg.pinv(pose.direction_covariance, rcond=1e-6) @ shift)
+        eigenvalues = np.linalg.eigvalsh(pose.covariance)
+        assert eigenvalues.min() > 0
+        np.testing.assert_allclose(pose.direction_covariance @ pose.direction, 0, atol=1e-12)
+    assert 1.5 < np.median(of_rotation) < 5  # 2.37 of a chi-square with 3 degrees of freedom
+    assert 0.7 < np.median(of_direction) < 3  # 1.39 with 2
+    assert np.mean(np.array(of_rotation) < 3 * 7.8) > 0.9
+
+
+def test_of_points_on_a_plane_the_truth_is_among_the_poses(point_scene):
+    right, first = 0, 0
+    for seed in range(8):
+        scene = point_scene.ring([0, 30], seed=seed)
+        scene.points[:, 2] = 0.1 * scene.points[:, 0] + 0.3 * scene.points[:, 1]
+        found = relate(*scene.features(seed=seed))
+        angles = [degrees(pose.rotation, scene.relative(0, 1)[0]) for pose in found.poses]
+        right += min(angles) < 3
+        first += angles[0] < 3
+        # What cannot be told apart shares the probability.
+        assert all(pose.weight > 0 for pose in found.poses)
+        solid = relate(*point_scene.ring([0, 30], seed=seed).features(seed=seed))
+        assert found.probability < solid.probability
+    assert right >= 7
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_a_camera_that_only_turned(point_scene, noise):
+    scene = point_scene.ring([0, 15])
+    scene.translations[1] = scene.rotations[1] @ scene.translations[0]
+    found = relate(*scene.features(noise=noise))
+    assert min(degrees(pose.rotation, scene.relative(0, 1)[0]) for pose in found.poses) < 1.5
+    moved = point_scene.ring([0, 15])
+    parallax = relate(*moved.features()).poses[0]
+    for pose in found.poses:
+        assert np.trace(pose.direction_covariance) > 20 * np.trace(parallax.direction_covariance)
+
+
+def test_too_few_matches_say_nothing(point_scene):
+    scene = point_scene.ring([0, 25], points=LEAST_MATCHES - 1)
+    assert relate(*scene.features(noise=0)) is NOTHING
+    assert not NOTHING.agrees(np.eye(3))
+    assert peaks(NOTHING) == []
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_wrong_matches_alone_are_not_trusted(point_scene, seed):
+    scene = point_scene.ring([0, 25], points=80)
+    found = relate(*scene.features(outliers=80, seed=seed))
+    assert found.probability < 0.5
+    assert peaks(found) == []
+    assert not found.agrees(found.poses[0].rotation if found.poses else np.eye(3))
+
+
+def test_identical_features_everywhere_say_nothing():
+    """All rays the same, or all on a line: nothing to hold a pose, and no exception."""
+    generator = np.random.default_rng(0)
+    descriptors = generator.standard_normal((30, 128)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    same = LocalFeatures(np.zeros((30, 2)), descriptors, 1 / 800, False)
+    line = LocalFeatures(np.linspace(-0.2, 0.2, 30)[:, None] * [1.0, 0.3], descriptors, 1 / 800, False)
+    for first, second in [(same, same), (line, line), (same, line)]:
+        found = relate(first, second)
+        assert all(np.isfinite(pose.rotation).all() for pose in found.poses)
+
+
+def test_a_guessed_focal_length_widens_what_is_stated(point_scene):
+    scene = point_scene.ring([0, 30])
+    known = relate(*scene.features())
+    first, second = scene.features()
+    guessed = relate(first, replace(second, guessed=True))
+    np.testing.assert_array_equal(guessed.poses[0].rotation, known.poses[0].rotation)
+    added = guessed.poses[0].covariance - known.poses[0].covariance
+    # In proportion to the angle, most about the axis that was turned about.
+    axis = so3.log(known.poses[0].rotation)
+    angle = np.linalg.norm(axis)
+    assert math.sqrt(axis @ added @ axis) / angle == pytest.approx(0.1 * angle * math.sqrt(1.25))
+    assert np.linalg.eigvalsh(added).min() > 0
+    wider = guessed.poses[0].direction_covariance - known.poses[0].direction_covariance
+    np.testing.assert_allclose(np.linalg.eigvalsh(wider), [0, 0.01, 0.01], atol=1e-9)
+
+
+# Which features belong together.
+
+
+def test_matches_are_mutual_and_distinct():
+    generator = np.random.default_rng(0)
+    descriptors = generator.standard_normal((6, 128)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    rays = np.zeros((6, 2))
+    first = LocalFeatures(rays, descriptors, 1.0, False)
+    # The second view has 3, 1, 0 in that order, and 5 twice: what looks the same twice matches nothing.
+    second = LocalFeatures(rays[:5], descriptors[[3, 1, 0, 5, 5]], 1.0, False)
+    assert match(first, second).tolist() == [[0, 2], [1, 1], [3, 0]]
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_one_feature_cannot_be_distinct(count):
+    none = LocalFeatures(np.zeros((count, 2)), np.ones((count, 128), np.float32), 1.0, False)
+    some = LocalFeatures(np.zeros((5, 2)), np.eye(5, 128, dtype=np.float32), 1.0, False)
+    assert match(none, some).shape == (0, 2)
+    assert match(some, none).shape == (0, 2)
+
+
+# Features of a picture.
+
+
+def test_features_lie_where_the_picture_has_them():
+    """The same whether the part was shrunk, its sides to whole pixels that are not quite in proportion."""
+    view = textured(2, 612, 1187, intrinsics=Intrinsics(900, 910, 590, 310))
+    shrunk = find_features(view)
+    assert not shrunk.guessed
+    assert shrunk.pixel == pytest.approx(1187 / 800 / 905)
+    np.testing.assert_allclose(np.linalg.norm(shrunk.descriptors, axis=1), 1, atol=1e-5)
+    shifts = []
+    for top in (0, 452):
+        part = find_features(replace(view, box=BoundingBox(100, top, 500, top + 160)))
+        assert part.pixel == pytest.approx(1 / 2 / 905)
+        together = match(shrunk, part)
+        assert len(together) > 50
+        apart = (shrunk.rays[together[:, 0]] - part.rays[together[:, 1]]) * [900, 910]
+        shifts.append(np.median(apart, axis=0))
+    # SIFT itself has a bias of a quarter of a pixel of the picture it was given.
+    assert np.abs(shifts).max() < 0.4
+    assert abs(shifts[1][1] - shifts[0][1]) < 0.2
+
+
+def test_features_are_those_of_the_box():
+    view = textured(0, box=BoundingBox(50, 40, 150, 120))
+    inside = pixels(find_features(view), view)
+    assert len(inside) > 20
+    assert (inside >= [50, 40]).all()
+    assert (inside <= [150, 120]).all()
+    everywhere = pixels(find_features(view, surroundings=True), view)
+    assert ((everywhere < [50, 40]) | (everywhere > [150, 120])).any(1).sum() > 20
+
+
+def test_features_are_those_of_the_mask():
+    mask = np.zeros((160, 200), bool)
+    mask[30:130, 60:140] = True
+    view = textured(0, mask=mask)
+    inside = pixels(find_features(view), view)
+    assert len(inside) > 20
+    column, row = np.floor(inside).astype(int).T
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    assert near[row, column].all()
+    assert len(find_features(view, surroundings=True).rays) > len(inside)
+
+
+def test_a_crop_says_what_the_whole_picture_says():
+    whole = textured(1, box=BoundingBox(60, 40, 160, 130), mask=np.ones((160, 200), bool))
+    crop = replace(whole, image=whole.image[30:140, 50:170], mask=whole.mask[30:140, 50:170], origin=(50, 30))
+    a, b = find_features(whole), find_features(crop)
+    assert len(a.rays) > 20
+    np.testing.assert_array_equal(a.rays, b.rays)
+    np.testing.assert_array_equal(a.descriptors, b.descriptors)
+    assert a.pixel == b.pixel
+
+
+def test_without_intrinsics_the_focal_length_is_guessed():
+    view = textured(0)
+    features = find_features(view)
+    assert features.guessed
+    assert features.pixel == pytest.approx(1 / (2 * 1.2 * 200))
+    known = find_features(replace(view, intrinsics=Intrinsics(240, 240, 100, 80)))
+    assert not known.guessed
+    np.testing.assert_allclose(known.rays, features.rays)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (5, 3), (40, 60)])
+def test_pictures_without_features(size):
+    image = np.full((*size, 3), 128, np.uint8)
+    view = View(image, BoundingBox(0, 0, size[1], size[0]), size[1], size[0])
+    features = find_features(view)
+    assert features.rays.shape == (0, 2)
+    assert features.descriptors.shape == (0, 128)
+    assert relate(features, features) is NOTHING
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        BoundingBox(50, 50, 51, 51),
+        BoundingBox(50, 50, 50.2, 90),
+        BoundingBox(190, 150, 260, 220),
+        BoundingBox(300, 300, 320, 330),
+        BoundingBox(-40, -40, -10, -10),
+    ],
+)
+def test_a_box_with_hardly_a_pixel_has_no_features_of_elsewhere(box):
+    view = textured(0, box=box)
+    found = pixels(find_features(view), view)
+    assert (found >= [box.x0 - 1, box.y0 - 1]).all()
+    assert (found <= [box.x1 + 1, box.y1 + 1]).all()
+
+
+def test_an_empty_mask_has_no_features():
+    view = textured(0, mask=np.zeros((160, 200), bool))
+    assert len(find_features(view).rays) == 0
+
+
+# The background behind a turntable.
+
+
+def test_a_static_background_takes_no_part(ball_on_a_turntable, rotation_of_ball):
+    views = [ball_on_a_turntable(turn) for turn in (0, 20)]
+    truth = rotation_of_ball(20) @ rotation_of_ball(0).T
+    found = relate(*(find_features(view) for view in views))
+    assert found.probability > 0.5
+    assert degrees(found.poses[0].rotation, truth) < 4
+    # Admitted, it says that nothing moved.
+    misled = relate(*(find_features(view, surroundings=True) for view in views))
+    assert degrees(misled.poses[0].rotation, np.eye(3)) < 3
+
+
+# Trust, and what becomes of it.
+
+
+def test_trust_grows_with_inliers_and_their_share():
+    assert trust(100, 120, planar=False) > trust(30, 120, planar=False) > trust(10, 120, planar=False)
+    assert trust(30, 40, planar=False) > trust(30, 120, planar=False)
+    assert trust(30, 40, planar=False) > trust(30, 40, planar=True)
+    assert 0 < trust(8, 2000, planar=True) < 0.01
+    assert trust(2000, 2000, planar=False) < 1
+
+
+def pose(rotation, weight, sigma=0.01):
+    return RelativePose(rotation, np.array([1.0, 0, 0]), sigma**2 * np.eye(3), np.zeros((3, 3)), weight)
+
+
+def test_peaks_share_the_probability_of_the_poses():
+    poses = (pose(np.eye(3), 0.7), pose(so3.exp([0, 1.0, 0]), 0.3))
+    found = peaks(TwoViewGeometry(poses, np.zeros((9, 2), np.int64), 0.9))
+    assert sum(peak.probability for peak in found) == pytest.approx(0.9)
+    by_pose = [sum(p.probability for p in found if degrees(p.rotation, each.rotation) < 1) for each in poses]
+    assert by_pose == pytest.approx([0.63, 0.27])
+    # Never sharper than the intrinsics allow, and a share of it is much wider.
+    deviations = [math.degrees(math.sqrt(np.linalg.eigvalsh(peak.covariance).max())) for peak in found]
+    assert min(deviations) > 0.3
+    assert sorted(deviations)[-1] > 5
+
+
+def test_only_trusted_matches_with_the_cameras_rotation_count():
+    geometry = TwoViewGeometry((pose(np.eye(3), 1.0),), np.zeros((9, 2), np.int64), 0.9)
+    assert geometry.agrees(so3.exp([0, math.radians(9), 0]))
+    assert not geometry.agrees(so3.exp([0, math.radians(11), 0]))
+    assert not replace(geometry, probability=0.4).agrees(np.eye(3))
+
+
+# What is kept.
+
+
+def test_a_view_and_a_pair_are_looked_at_once_and_forgotten_with_the_view(monkeypatch):
+    looked, related = [], []
+    for name, calls in (("find_features", looked), ("relate", related)):
+        real = getattr(matches, name)
+        monkeypatch.setattr(matches, name, _counting(real, calls))
+    matcher = Matcher()
+    views = [textured(seed, 60, 60) for seed in range(3)]
+    assert list(matcher.geometries(views[:2])) == [(0, 1)]
+    assert list(matcher.geometries(views)) == [(0, 1), (0, 2), (1, 2)]
+    assert list(matcher.geometries(views[1:])) == [(0, 1)]
+    assert len(looked) == 3
+    assert len(related) == 3
+    del views, looked[:], related[:]
+    gc.collect()
+    assert len(matcher._features) == 0
+    assert len(matcher._pairs) == 0
+
+
+def _counting(real, calls):
+    def counted(*arguments, **options):
+        calls.append(len(arguments))
+        return real(*arguments, **options)
+
+    return counted
+
+
+def test_neighbouring_photographs(shared):
+    """20 to 40 degrees apart, an outdoor object without masks."""
+    capture = load_capture(shared / "captures" / "dev" / "saharov32")
+    errors = []
+    for i in (0, 6, 12, 18, 24, 28):
+        rotations = [np.asarray(capture.photos[k].camera_from_world)[:, :3] for k in (i, i + 2)]
+        truth = rotations[1] @ rotations[0].T
+        assert 18 < degrees(truth, np.eye(3)) < 40
+        found = relate(*(find_features(capture.view(k)) for k in (i, i + 2)))
+        errors.append(degrees(found.poses[0].rotation, truth) if found.poses else 180)
+    assert np.mean(np.array(errors) < 5) >= 0.8, errors
