@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from relpose_ros.geometry import so3
+from relpose_ros.inference import bundle_adjustment
+from relpose_ros.inference.bundle_adjustment import LEAST_POINTS, _Observations, _Problem, refine
+from relpose_ros.inference.matches import NOTHING, RelativePose, TwoViewGeometry, match
+
+ANGLES = [0.0, 20.0, 40.0, 60.0]
+
+
+def geometries(scene, features, probability=0.95):
+    """All features that match, with the true pose of each pair."""
+    found = {}
+    for i, j in itertools.combinations(range(len(features)), 2):
+        rotation, direction = scene.relative(i, j)
+        pose = RelativePose(rotation, direction, 1e-4 * np.eye(3), 1e-4 * np.eye(3), 1.0)
+        found[i, j] = TwoViewGeometry((pose,), match(features[i], features[j]), probability)
+    return found
+
+
+def perturbed(scene, degrees=2.0, shift=0.03, seed=0):
+    """Poses of which all but the first are off."""
+    generator = np.random.default_rng([seed, 2])
+    turns = generator.standard_normal((len(scene.rotations), 3))
+    turns *= np.radians(degrees) / np.linalg.norm(turns, axis=1, keepdims=True)
+    shifts = shift * generator.standard_normal(turns.shape)
+    turns[0] = shifts[0] = 0
+    return so3.exp(turns) @ scene.rotations, scene.translations + shifts
+
+
+def rotation_error(rotations, scene):
+    return np.degrees(so3.angle_between(rotations, scene.rotations)).max()
+
+
+def centre_error(rotations, translations, scene):
+    """Largest error of a centre once the scale about the first camera, which nothing fixes, is right."""
+    found = -np.einsum("nba,nb->na", rotations, translations)
+    truth = -np.einsum("nba,nb->na", scene.rotations, scene.translations)
+    a, b = found - found[0], truth - truth[0]
+    return np.linalg.norm(a * (a * b).sum() / (a * a).sum() - b, axis=1).max()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_poses_two_degrees_off_become_exact(point_scene, seed):
+    scene = point_scene.ring(ANGLES, seed=seed)
+    features = scene.features(noise=0.5, seed=seed)
+    rotations, translations = perturbed(scene, seed=seed)
+    found = refine(rotations, translations, features, geometries(scene, features))
+    assert found.moved == (0, 1, 2, 3)
+    assert rotation_error(rotations, scene) > 1.9
+    assert rotation_error(found.rotations, scene) < 0.3
+    assert centre_error(rotations, translations, scene) > 0.03
+    assert centre_error(found.rotations, found.translations, scene) < 0.012
+    # Half a pixel in two directions, less what the points took up.
+    assert 0.3 < found.error_after < 0.9
+    assert found.error_before > 3 * found.error_after
+    np.testing.assert_array_equal(found.rotations[0], rotations[0])
+    np.testing.assert_array_equal(found.translations[0], translations[0])
+    np.testing.assert_allclose(found.rotations, so3.project(found.rotations), atol=1e-12)
+
+
+def test_the_scale_stays_about_where_it_was(point_scene):
+    scene = point_scene.ring(ANGLES)
+    features = scene.features()
+    rotations, translations = perturbed(scene)
+    found = refine(rotations, translations, features, geometries(scene, features))
+    lengths = np.linalg.norm(found.translations[1:], axis=1) / np.linalg.norm(translations[1:], axis=1)
+    assert np.abs(lengths - 1).max() < 0.1
+
+
+def test_wrong_matches_do_not_break_it(point_scene):
+    """A third of the tracks lead to anywhere in each view."""
+    scene = point_scene.ring(ANGLES, points=240)
+    features = scene.features(outliers=80)
+    rotations, translations = perturbed(scene)
+    found = refine(rotations, translations, features, geometries(scene, features))
+    assert rotation_error(found.rotations, scene) < 0.4
+    assert centre_error(found.rotations, found.translations, scene) < 0.02
+
+
+def test_tracks_that_pass_a_view_twice_are_left_out(point_scene):
+    scene = point_scene.ring(ANGLES[:3], points=30)
+    features = scene.features()
+    pairs = geometries(scene, features)
+    whole = bundle_adjustment._shared_points({pair: g.inliers for pair, g in pairs.items()}, features)
+    assert int(whole.point.max()) + 1 == 30
+    assert (np.bincount(whole.point) == 3).all()
+    # In one pair, the partners of two features are exchanged: both tracks meet both, in two views.
+    crossed = pairs[0, 2].inliers.copy()
+    crossed[[0, 1], 1] = crossed[[1, 0], 1]
+    pairs[0, 2] = replace(pairs[0, 2], inliers=crossed)
+    left = bundle_adjustment._shared_points({pair: g.inliers for pair, g in pairs.items()}, features)
+    assert int(left.point.max()) + 1 == 28
+
+
+def test_sightings_of_a_track_are_of_one_point(point_scene):
+    scene = point_scene.ring(ANGLES, points=30)
+    features = scene.features(noise=0.0)
+    pairs = geometries(scene, features)
+    seen = bundle_adjustment._shared_points({pair: g.inliers for pair, g in pairs.items()}, features)
+    points, errors = bundle_adjustment._triangulate((scene.rotations, scene.translations), seen)
+    assert errors.max() < 1e-3
+    distances = np.linalg.norm(points[:, None] - scene.points[None], axis=-1)
+    assert distances.min(1).max() < 1e-6
+    assert sorted(distances.argmin(1)) == list(range(30))
+
+
+def test_a_view_without_matches_stays(point_scene):
+    scene = point_scene.ring(ANGLES)
+    features = scene.features()
+    pairs = {pair: NOTHING if 2 in pair else g for pair, g in geometries(scene, features).items()}
+    rotations, translations = perturbed(scene)
+    found = refine(rotations, translations, features, pairs)
+    assert found.moved == (0, 1, 3)
+    np.testing.assert_array_equal(found.rotations[2], rotations[2])
+    np.testing.assert_array_equal(found.translations[2], translations[2])
+    assert (
+        rotation_error(found.rotations[[0, 1, 3]], replace(scene, rotations=scene.rotations[[0, 1, 3]])) < 0.3
+    )
+
+
+def test_of_two_groups_that_share_nothing_the_larger_moves(point_scene):
+    scene = point_scene.ring([0, 20, 40, 60, 80], points=100)
+    features = scene.features()
+    apart = {
+        pair: NOTHING if (pair[0] < 2) != (pair[1] < 2) else g
+        for pair, g in geometries(scene, features).items()
+    }
+    rotations, translations = perturbed(scene)
+    found = refine(rotations, translations, features, apart)
+    assert found.moved == (2, 3, 4)
+    for camera in (0, 1, 2):
+        np.testing.assert_array_equal(found.rotations[camera], rotations[camera])
+    for camera in (3, 4):
+        truth = scene.rotations[camera] @ scene.rotations[2].T
+        assert math.degrees(so3.angle_between(found.rotations[camera] @ found.rotations[2].T, truth)) < 0.5
+
+
+def test_too_few_points(point_scene):
+    scene = point_scene.ring(ANGLES, points=LEAST_POINTS - 1)
+    features = scene.features(noise=0)
+    assert refine(*perturbed(scene), features, geometries(scene, features)) is None
+
+
+def test_no_matches(point_scene):
+    scene = point_scene.ring(ANGLES)
+    features = scene.features()
+    nothing = dict.fromkeys(geometries(scene, features), NOTHING)
+    assert refine(*perturbed(scene), features, nothing) is None
+    assert refine(*perturbed(scene), features, {}) is None
+
+
+def test_matches_that_are_not_trusted_or_contradict_the_cameras(point_scene):
+    scene = point_scene.ring(ANGLES)
+    features = scene.features()
+    assert refine(*perturbed(scene), features, geometries(scene, features, probability=0.4)) is None
+    assert refine(*perturbed(scene, degrees=60), features, geometries(scene, features)) is None
+
+
+def test_cameras_in_one_place_see_no_depth(point_scene):
+    scene = point_scene.ring(ANGLES)
+    scene.translations = np.einsum("nab,b->na", scene.rotations, scene.translations[0])
+    features = scene.features()
+    assert refine(scene.rotations, scene.translations, features, geometries(scene, features)) is None
+
+
+def test_wrong_matches_alone(point_scene):
+    scene = point_scene.ring(ANGLES, points=60)
+    features = scene.features(outliers=60)
+    rotations, translations = perturbed(scene)
+    found = refine(rotations, translations, features, geometries(scene, features))
+    assert found is None or found.error_after < found.error_before
+
+
+def test_same_bits_twice(point_scene):
+    scene = point_scene.ring(ANGLES)
+    features = scene.features(outliers=30)
+    pairs = geometries(scene, features)
+    first, second = (refine(*perturbed(scene), features, pairs) for _ in range(2))
+    assert first.rotations.tobytes() == second.rotations.tobytes()
+    assert first.translations.tobytes() == second.translations.tobytes()
+
+
+def test_the_jacobian_is_that_of_the_residuals(point_scene):
+    scene = point_scene.ring(ANGLES[:3], points=8)
+    camera, point = (each.reshape(-1) for each in np.meshgrid(np.arange(3), np.arange(8)))
+    generator = np.random.default_rng(0)
+    local = np.einsum("qab,qb->qa", scene.rotations[camera], scene.points[point]) + scene.translations[camera]
+    rays = local[:, :2] / local[:, 2:] + 0.004 * generator.standard_normal((24, 2))
+    seen = _Observations(camera, point, rays, np.full(24, 1 / 800))
+    poses = scene.rotations, scene.translations
+    problem = _Problem(poses, seen, 3.0, poses)
+    start = np.concatenate([np.zeros(12), scene.points.reshape(-1)])
+    jacobian = problem.jacobian(start).toarray()
+    assert jacobian.shape == (2 * 24 + 12, 12 + 24)
+    for column in range(len(start)):
+        step = np.zeros_like(start)
+        step[column] = 1e-6
+        slope = (problem.residuals(start + step) - problem.residuals(start - step)) / 2e-6
+        np.testing.assert_allclose(
+            jacobian[:, column], slope, rtol=1e-5, atol=1e-4 * max(1, np.abs(slope).max())
+        )
