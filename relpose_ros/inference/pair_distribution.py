@@ -101,11 +101,13 @@ def search(
     kept.append((level, cells, values))
 
     rotations = torch.cat([_rotations(at, index) for at, index, _ in kept], 1)
-    scores = torch.cat([value for _, _, value in kept], 1).double()
+    blurred = torch.cat([value for _, _, value in kept], 1).double()
+    left = [energies.at_centres(at, index, value) for at, index, value in kept[:-1]]
+    scores = torch.cat([*left, values], 1).double()
     levels = [at for at, index, _ in kept for _ in range(index.shape[1])]
     log_volumes = torch.tensor([-math.log(so3_grid.size(at)) for at in levels], dtype=torch.float64)
     spacings = torch.tensor([so3_grid.cell_spacing(at) for at in levels], dtype=torch.float64)
-    tops, heights = peaks(rotations, scores, settings.modes, settings.separation)
+    tops, heights = peaks(rotations, blurred, settings.modes, settings.separation)
     modes, mode_energies = _refine_modes(
         energies, pick(rotations, tops), heights, spacings[tops] / 2, settings
     )

@@ -166,6 +166,19 @@ class PairEnergies:
         blur = so3_grid.cell_spacing(level) / 2
         return learned + self.evidence(torch.arange(self.count), rotations, blur).to(learned.dtype)
 
+    def at_centres(self, level: int, cells: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """What `on_cells` gave, without the blur of the evidence. (P, C) twice -> (P, C).
+
+        The blur shows from afar where a sharp peak is. What it lends to cells beside the peak is counted in
+        the peak's own cells already.
+        """
+        if self.evidence is None:
+            return values
+        pairs = torch.arange(self.count)
+        rotations = torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
+        blurred = self.evidence(pairs, rotations, so3_grid.cell_spacing(level) / 2)
+        return values + (self.evidence(pairs, rotations) - blurred).to(values.dtype)
+
     def at(self, pairs: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
         """Energies at any rotations; differentiable. (Q,) int64 pairs, (Q, K, 3, 3) -> (Q, K)."""
         parts = [

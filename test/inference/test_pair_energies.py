@@ -13,7 +13,7 @@ from relpose_ros.geometry import so3, so3_grid
 from relpose_ros.inference.global_rotations import joint_scores, solve
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
-from relpose_ros.inference.rotation_evidence import Peak, RotationEvidence
+from relpose_ros.inference.rotation_evidence import FREEDOM, Peak, RotationEvidence
 
 SHARP = math.radians(0.3)
 
@@ -135,6 +135,30 @@ def test_a_sharp_peak_is_found_anywhere(fisher_scene_type, seed):
     with torch.no_grad():
         found = search(energies, GridEmbeddings(scene))
     assert math.degrees(so3.angle_between(found.modes[0, 0].numpy(), scene.relative(0, 1))) < 0.2
+
+
+@pytest.mark.parametrize("views", [2, 8])
+@pytest.mark.parametrize("deviation", [0.4, 3.0, 8.0])
+def test_a_peak_holds_its_probability_once_searched(fisher_scene, cameras_around, views, deviation):
+    """However many pairs share the search: what the blur lends to other cells is not counted twice."""
+    scene = fisher_scene(cameras_around(views, 1))
+    peaks = {
+        pair: sharp(scene.relative(*pair), 0.9, math.radians(deviation))
+        for pair in itertools.combinations(range(views), 2)
+    }
+    energies = energies_of(scene, peaks, math.inf)
+    with torch.no_grad():
+        found = search(energies, GridEmbeddings(scene))
+    # Of Student's t in three dimensions, by drawing from it.
+    generator = np.random.default_rng(0)
+    scales = np.sqrt(generator.chisquare(FREEDOM, 100_000) / FREEDOM)
+    lengths = np.linalg.norm(generator.standard_normal((100_000, 3)), axis=1) / scales
+    expected = 0.9 * (lengths * deviation < 15).mean()
+    for pair in range(0, energies.count, 5):
+        true = scene.relative(int(energies.i[pair]), int(energies.j[pair]))
+        near = so3.angle_between(found.rotations[pair].numpy(), true) < math.radians(15)
+        assert float(found.masses()[pair, near].sum()) == pytest.approx(expected, abs=0.03)
+        assert float(found.log_normaliser()[pair].exp()) == pytest.approx(1, abs=0.16)
 
 
 def test_a_sharp_peak_sharpens_what_the_network_knows(fisher_scene, cameras_around):
