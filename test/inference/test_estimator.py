@@ -1,16 +1,19 @@
 from __future__ import annotations
 
 import gc
+import math
 import threading
 
 import numpy as np
 import pytest
 import torch
 
-from relpose_ros.estimates import Verdict
+from relpose_ros.estimates import Evidence, Verdict
 from relpose_ros.geometry import cameras, so3
+from relpose_ros.inference import bundle_adjustment, matches
+from relpose_ros.inference.bundle_adjustment import Refined
 from relpose_ros.inference.calibration import Calibration
-from relpose_ros.inference.estimator import Estimator, ScanError
+from relpose_ros.inference.estimator import Estimator, EvidenceSettings, ScanError
 from relpose_ros.network.checkpoint import random_network, write_network
 from relpose_ros.views import BoundingBox, Scan, View
 
@@ -165,3 +168,169 @@ def test_rotations_of_features(network):
         features = estimator._features(views)
     expected = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
     np.testing.assert_array_equal(estimator.rotations(features), expected)
+
+
+# What the pictures themselves say: a ball on a turntable before a background that stays.
+
+TURNS = (0, 20, 40)
+CALIBRATED = Calibration(temperature=3.0, flat=0.1)
+
+
+@pytest.fixture(scope="module")
+def ball(ball_on_a_turntable):
+    return Scan("ball", tuple(ball_on_a_turntable(turn) for turn in TURNS))
+
+
+@pytest.fixture
+def ball_errors(rotation_of_ball):
+    truth = np.stack([rotation_of_ball(turn) @ rotation_of_ball(TURNS[0]).T for turn in TURNS])
+
+    def errors(estimate):
+        found = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
+        return np.degrees(so3.angle_between(found, truth))
+
+    return errors
+
+
+def estimated(network, scan, **evidence):
+    return Estimator(network, CALIBRATED, EvidenceSettings(**evidence)).estimate(scan)
+
+
+def test_matches_give_the_rotations_that_random_weights_cannot(network, ball, ball_errors):
+    off = estimated(network, ball, use="off")
+    pairs = estimated(network, ball, use="pairs")
+    assert ball_errors(off).max() > 30
+    assert ball_errors(pairs).max() < 1.5
+    assert [pair.evidence for pair in off.pairs] == [Evidence.LEARNED] * 3
+    assert [pair.evidence for pair in pairs.pairs] == [Evidence.LEARNED | Evidence.GEOMETRIC] * 3
+    for with_matches, without in zip(pairs.pairs, off.pairs, strict=True):
+        assert with_matches.entropy < without.entropy - 3
+        assert with_matches.probability_within_15_deg > 0.8
+    assert pairs.verdict is Verdict.ENOUGH
+    for with_matches, without in zip(pairs.cameras[1:], off.cameras[1:], strict=True):
+        assert np.trace(with_matches.covariance[:3, :3]) < 0.2 * np.trace(without.covariance[:3, :3])
+
+
+def test_shared_points_refine_the_poses(network, ball, ball_errors):
+    pairs, refined = (estimated(network, ball, use=use) for use in ("pairs", "refine"))
+    assert ball_errors(refined).max() < 0.6
+    assert numbers(refined) != numbers(pairs)
+    np.testing.assert_allclose(refined.cameras[0].object_from_camera, np.eye(3), atol=1e-12)
+    # The pairs' distributions are what they were; how the poses agree with them is said anew.
+    for a, b in zip(refined.pairs, pairs.pairs, strict=True):
+        assert a.entropy == b.entropy
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_a_refinement_that_contradicts_the_pairs_is_not_taken(network, ball, monkeypatch):
+    calls = []
+
+    def bent(rotations, translations, *rest):
+        calls.append(rotations)
+        turned = np.concatenate([rotations[:1], so3.exp([0, 0.4, 0]) @ rotations[1:]])
+        return Refined(turned, translations, (0, 1, 2), 5.0, 0.1)
+
+    monkeypatch.setattr(bundle_adjustment, "refine", bent)
+    refused = estimated(network, ball, use="refine")
+    assert len(calls) == 1
+    assert numbers(refused) == numbers(estimated(network, ball, use="pairs"))
+
+
+def test_geometry_alone(network, ball, ball_errors):
+    """The network's rotations are silent: other weights, the same rotations."""
+    alone = estimated(network, ball, use="pairs", learned=False)
+    assert [pair.evidence for pair in alone.pairs] == [Evidence.GEOMETRIC] * 3
+    assert ball_errors(alone).max() < 1.5
+    other = estimated(random_network("compact", 2), ball, use="pairs", learned=False)
+    assert [pair.entropy for pair in other.pairs] == pytest.approx([pair.entropy for pair in alone.pairs])
+    for a, b in zip(alone.cameras, other.cameras, strict=True):
+        assert math.degrees(so3.angle_between(a.object_from_camera, b.object_from_camera)) < 0.1
+    nothing = estimated(network, scan(0, 1), use="off", learned=False)
+    assert nothing.pairs[0].evidence == Evidence(0)
+    assert nothing.pairs[0].entropy == pytest.approx(0, abs=1e-6)
+
+
+def test_surroundings_mislead_where_the_object_is_what_turns(network, ball, ball_errors):
+    misled = estimated(network, ball, use="pairs", learned=False, surroundings=True)
+    np.testing.assert_allclose(ball_errors(misled), TURNS, atol=2)
+
+
+def test_no_match_no_opinion(network):
+    """Pictures that share nothing: to the bit what the network alone says."""
+    strangers = scan(0, 1, 2)
+    assert numbers(estimated(network, strangers, use="off")) == numbers(
+        estimated(network, strangers, use="refine")
+    )
+
+
+def test_off_looks_for_no_features(network, ball, monkeypatch):
+    def never(*arguments, **options):
+        raise AssertionError
+
+    monkeypatch.setattr(matches, "find_features", never)
+    estimated(network, ball, use="off")
+    with pytest.raises(AssertionError):
+        estimated(network, ball, use="pairs")
+
+
+@pytest.mark.parametrize("use", ["off", "refine"])
+def test_a_known_distance_gives_metres(network, ball, use):
+    plain = estimated(network, ball, use=use)
+    metric = estimated(network, ball, use=use, first_view_distance=0.6)
+    assert not plain.scale_known
+    assert metric.scale_known
+    assert np.linalg.norm(metric.cameras[0].position) == pytest.approx(0.6, rel=0.02)
+    unit = np.repeat([0.6, 1.0], 3)
+    for a, b in zip(plain.cameras, metric.cameras, strict=True):
+        np.testing.assert_array_equal(a.object_from_camera, b.object_from_camera)
+        np.testing.assert_allclose(b.position, 0.6 * a.position)
+        np.testing.assert_allclose(b.covariance, unit[:, None] * a.covariance * unit, rtol=1e-12)
+        assert np.linalg.eigvalsh(b.covariance).min() > -1e-12
+    assert plain.score == metric.score
+    assert plain.verdict == metric.verdict
+
+
+def test_same_bits_with_evidence_whatever_was_estimated_before(network, ball, ball_on_a_turntable):
+    grown = Estimator(network, CALIBRATED)
+    grown.estimate(Scan("ball", ball.views[:2]))
+    grown.estimate(scan(7, 8))
+    grown.estimate(Scan("ball", ball.views[1:]))
+    again = Scan("ball", tuple(ball_on_a_turntable(turn) for turn in TURNS))
+    assert numbers(grown.estimate(ball)) == numbers(Estimator(network, CALIBRATED).estimate(again))
+
+
+def test_features_once_a_view_and_matches_once_a_pair(network, ball_on_a_turntable, monkeypatch):
+    looked, related = [], []
+    find, relate = matches.find_features, matches.relate
+    monkeypatch.setattr(
+        matches, "find_features", lambda view, **options: looked.append(1) or find(view, **options)
+    )
+    monkeypatch.setattr(matches, "relate", lambda *both: related.append(1) or relate(*both))
+    estimator = Estimator(network, CALIBRATED)
+    views = tuple(ball_on_a_turntable(turn) for turn in TURNS)
+    estimator.estimate(Scan("ball", views[:2]))
+    assert (len(looked), len(related)) == (2, 1)
+    estimator.estimate(Scan("ball", views))
+    assert (len(looked), len(related)) == (3, 3)
+    estimator.estimate(Scan("ball", views[1:]))
+    estimator.pair_masses(Scan("ball", views))
+    assert (len(looked), len(related)) == (3, 3)
+    del views
+    gc.collect()
+    assert len(estimator._matcher._features) == 0
+
+
+def test_pair_masses_hold_what_matches_say(network, ball):
+    estimator = Estimator(network, CALIBRATED)
+    estimate = estimator.estimate(ball)
+    for pair, (rotations, masses) in zip(estimate.pairs, estimator.pair_masses(ball), strict=True):
+        assert masses.sum() == pytest.approx(1)
+        near = so3.angle_between(rotations, pair.camera_j_from_camera_i) < math.radians(15)
+        assert masses[near].sum() == pytest.approx(pair.probability_within_15_deg, abs=0.03)
+
+
+def test_weights_with_evidence(network, tmp_path, ball):
+    write_network(network, tmp_path / "plain.safetensors")
+    loaded = Estimator.from_weights(tmp_path / "plain.safetensors", evidence=EvidenceSettings(use="off"))
+    assert loaded.estimate(ball).pairs[0].evidence == Evidence.LEARNED
+    assert Estimator.from_weights(tmp_path / "plain.safetensors").estimate(ball).pairs[0].evidence == 3

@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from relpose_ros.captures.folder import Frame, load_capture, save_capture
+from relpose_ros.evaluation.match_trust import RIGHT, MatchedPairs, fit_trust, observe
+from relpose_ros.geometry import so3
+from relpose_ros.inference.matches import find_features, relate, trust
+from relpose_ros.views import BoundingBox, Intrinsics, View
+
+FOCAL, SIDE = 300.0, 160
+TURNS = (0.0, 14.0, 28.0)
+
+
+@pytest.fixture(scope="module")
+def textures():
+    import cv2
+
+    generator = np.random.default_rng(0)
+    noise = [cv2.GaussianBlur(generator.standard_normal((160, 160)), (0, 0), size) for size in (1.5, 3)]
+    return np.clip(128 + 50 * sum(each / each.std() for each in noise), 0, 255)
+
+
+def photograph(textures, turn_deg):
+    """A corner of two textured walls, the camera on its arc around it: view and (3, 4) camera_from_world."""
+    rotation = so3.exp([0.05, math.radians(turn_deg - 14), 0])
+    translation = np.array([0.0, 0.0, 2.0])
+    column, row = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
+    rays = np.stack([(column - SIDE / 2) / FOCAL, (row - SIDE / 2) / FOCAL, np.ones_like(row)], -1) @ rotation
+    centre = -rotation.T @ translation
+    image = np.full((SIDE, SIDE), 90.0)
+    for sign in (-1, 1):
+        normal = np.array(
+            [sign * math.sin(0.9), 0, -math.cos(0.9)]
+        )  # walls z = |x| tan(0.9), met at the axis
+        depth = -(centre @ normal) / (rays @ normal)
+        points = centre + depth[..., None] * rays
+        along = np.linalg.norm(points[..., [0, 2]], axis=-1)
+        u, v = 80 + sign * 130 * along, 80 + 110 * points[..., 1]
+        on = (sign * points[..., 0] > 0) & (np.abs(u - 80) < 79) & (np.abs(v - 80) < 79) & (depth > 0)
+        image[on] = textures[v[on].astype(int), u[on].astype(int)]
+    pixels = np.repeat(image[..., None], 3, -1).astype(np.uint8)
+    camera = Intrinsics(FOCAL, FOCAL, SIDE / 2, SIDE / 2)
+    view = View(pixels, BoundingBox(0, 0, SIDE, SIDE), SIDE, SIDE, intrinsics=camera)
+    return view, np.concatenate([rotation, translation[:, None]], 1)
+
+
+@pytest.fixture(scope="module")
+def capture(textures, tmp_path_factory):
+    """Three photos whose cameras are known, a fourth whose camera is not, a fifth that shows nothing."""
+    frames = [Frame(*photograph(textures, turn)) for turn in TURNS]
+    frames.append(Frame(photograph(textures, 20.0)[0]))
+    _, pose = photograph(textures, 7.0)
+    frames.append(Frame(photograph(np.full_like(textures, 90), 7.0)[0], pose))
+    return save_capture(tmp_path_factory.mktemp("corner") / "corner", frames)
+
+
+def test_observes_the_pairs_whose_cameras_are_known(capture):
+    pairs = observe(load_capture(capture.folder), masked=True)
+    assert pairs.predictors.shape == (3, 3)  # nothing matches the plain one
+    assert pairs.right.tolist() == [True, True, True]
+    assert pairs.errors.shape == (3, 3)
+    assert pairs.covariances.shape == (3, 3, 3)
+    assert np.linalg.norm(pairs.errors, axis=1).max() < RIGHT
+    found = relate(*(find_features(capture.view(k)) for k in (0, 1)))
+    assert math.exp(pairs.predictors[0, 0]) == pytest.approx(len(found.inliers))
+    assert (pairs.predictors[:, 1] <= 0).all()
+    # By the same predictors the matches say how far to trust themselves.
+    log_inliers, log_share, _ = pairs.predictors[0]
+    inliers = round(math.exp(log_inliers))
+    stated = {trust(inliers, round(inliers / math.exp(log_share)), planar=planar) for planar in (False, True)}
+    assert found.probability in stated
+
+
+def test_a_wrong_pose_on_file_counts_as_wrong(capture, textures, tmp_path):
+    frames = [Frame(*photograph(textures, turn)) for turn in TURNS[:2]]
+    turned = so3.exp([0, 0, 0.5]) @ frames[1].camera_from_world
+    wrong = save_capture(tmp_path / "wrong", [frames[0], Frame(frames[1].view, turned)])
+    pairs = observe(wrong, masked=True)
+    assert pairs.right.tolist() == [False]
+    assert pairs.errors.shape == (0, 3)
+    assert pairs.covariances.shape == (0, 3, 3)
+
+
+def test_the_regression_finds_the_coefficients_of_its_own_kind():
+    generator = np.random.default_rng(0)
+    coefficients = np.array([-6.0, 2.0, 1.0, -0.8])
+    predictors = np.stack(
+        [generator.uniform(2, 6, 8000), generator.uniform(-2, 0, 8000), generator.integers(0, 2, 8000)], 1
+    )
+    chance = 1 / (1 + np.exp(-(coefficients[0] + predictors @ coefficients[1:])))
+    right = generator.uniform(size=8000) < chance
+    none = np.zeros((0, 3))
+    found = fit_trust(MatchedPairs(predictors, right, none, none[..., None]))
+    np.testing.assert_allclose(found, coefficients, rtol=0.15, atol=0.1)
+    # The likelihood's slope vanishes: as many are right as were said to be.
+    stated = 1 / (1 + np.exp(-(found[0] + predictors @ found[1:])))
+    assert stated.mean() == pytest.approx(right.mean(), abs=1e-6)
+
+
+def test_few_pairs_make_nothing_certain():
+    """Perfectly separable: without the ridge the coefficients would have no end."""
+    predictors = np.array([[2.0, -1, 0], [2.2, -1, 0], [4.0, -1, 0], [4.4, -1, 0]])
+    right = np.array([False, False, True, True])
+    none = np.zeros((0, 3))
+    found = fit_trust(MatchedPairs(predictors, right, none, none[..., None]))
+    stated = 1 / (1 + np.exp(-(found[0] + predictors @ found[1:])))
+    assert np.isfinite(found).all()
+    assert (stated[right] > 0.8).all()
+    assert (stated[~right] < 0.2).all()
+    assert np.abs(stated - right).max() > 0.003
