@@ -104,8 +104,8 @@ def _textured_object() -> Scene:
         ),
         name="textured_object",
     ).normalised()
-    places = [(-75, 22), (-40, 30), (-5, 24), (35, 38), (80, 20), (125, 32), (175, 25), (220, 45)]
-    shots = _shots(thing, places, distance=3.6)
+    places = [(-75, 22), (-48, 30), (-22, 24), (5, 38), (31, 22), (58, 32), (84, 24), (112, 36)]
+    shots = _shots(thing, places, distance=3.1)
     return Scene(thing, _table(thing, wood=True), shots, Motion.CAMERA)
 
 
@@ -265,25 +265,29 @@ def _boards() -> Image:
 
 
 def _panel(rng: np.random.Generator, colour: tuple[int, int, int], title: str, small: str) -> Image:
-    """One printed side, 256 x 256: a frame, a title, an ornament, small print."""
+    """One printed side, 256 x 256: a frame, a title, an ornament, small print, on patterned paper."""
     image = np.empty((256, 256, 3), np.uint8)
     image[:] = colour
+    for _ in range(260):
+        spot, radius = rng.integers(0, 256, 2).tolist(), int(rng.integers(2, 6))
+        shade = (np.asarray(colour) * float(rng.uniform(0.72, 1.22))).clip(0, 255).astype(int).tolist()
+        cv2.circle(image, spot, radius, shade, -1, cv2.LINE_AA)
     dark = sum(colour) < 380
     ink = (244, 234, 206) if dark else (92, 40, 34)
     cv2.rectangle(image, (12, 12), (243, 243), ink, 3)
     size = cv2.getTextSize(title, cv2.FONT_HERSHEY_TRIPLEX, 1.0, 2)[0][0]
     scale = 190 / size
     cv2.putText(image, title, (33, 84), cv2.FONT_HERSHEY_TRIPLEX, scale, ink, 2, cv2.LINE_AA)
-    for _ in range(9):
-        centre, angle = rng.integers((50, 115), (206, 190)).tolist(), float(rng.uniform(0, 180))
+    for _ in range(14):
+        centre, angle = rng.integers((40, 110), (216, 195)).tolist(), float(rng.uniform(0, 180))
         leaf = (
             (np.asarray(ink) * 0.5 + np.asarray(colour) * 0.5 + rng.normal(0, 25, 3))
             .clip(0, 255)
             .astype(int)
             .tolist()
         )
-        cv2.ellipse(image, centre, (26, 9), angle, 0, 360, leaf, -1, cv2.LINE_AA)
-        cv2.ellipse(image, centre, (26, 9), angle, 0, 360, ink, 1, cv2.LINE_AA)
+        cv2.ellipse(image, centre, (22, 8), angle, 0, 360, leaf, -1, cv2.LINE_AA)
+        cv2.ellipse(image, centre, (22, 8), angle, 0, 360, ink, 1, cv2.LINE_AA)
     cv2.putText(image, small, (48, 226), cv2.FONT_HERSHEY_COMPLEX, 0.8, ink, 1, cv2.LINE_AA)
     return image
 

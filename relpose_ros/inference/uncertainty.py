@@ -29,6 +29,9 @@ LEAST_WEIGHT = 0.02
 """Modes below it are not reported: they are ripples."""
 RUNNER_UP_WEIGHT = 0.15
 """A second mode matters from here on: about one chance in seven of being the true one."""
+SURE = 0.85
+"""Probability around the final poses from which on a matched pair's gross errors are told as a probability
+alone."""
 FLOOR = math.radians(0.1)
 """The solver's own accuracy, rad: the standard deviation stated for what the gauge fixes by definition."""
 
@@ -132,6 +135,26 @@ def _second_moment(
     return np.asarray(np.einsum("l,la,lb->ab", share, vectors, vectors) + finest * np.eye(3))
 
 
+def _about(
+    distributions: PairDistributions,
+    energies: PairEnergies,
+    pair: int,
+    relative: torch.Tensor,
+    masses: torch.Tensor,
+) -> torch.Tensor:
+    """The masses (L,) of a pair that tell how exactly it holds the poses it is right about.
+
+    Few chances of a gross error, far away, would be most of a second moment. Where matches agree with the
+    poses that chance is told apart, as a probability, and only the mass around the poses counts.
+    """
+    mass = masses[pair]
+    if energies.evidence is None or not energies.evidence.spoken[pair]:
+        return mass
+    angles = _angles(distributions.rotations[pair], relative[pair : pair + 1])[:, 0]
+    near = _inside(angles, BASIN, distributions.spacings) * mass
+    return near if float(near.sum()) >= SURE else mass
+
+
 def _turns(rotations: FloatArray) -> FloatArray:
     """As `so3.log`, sooner: straight from the skew part, but where that vanishes. (L, 3, 3) -> (L, 3)."""
     skew = rotations - rotations.transpose(0, 2, 1)
@@ -181,7 +204,13 @@ def camera_covariances(
         # -R^T e in the object's axes, and moves the centre -R^T t by -R^T (t x e).
         turn = np.concatenate([-object_from_camera @ so3.hat(translations[camera]), -object_from_camera])
         covariances[camera] = turn @ spread[camera] @ turn.T
-        covariances[camera, :3, :3] += object_from_camera @ shifts[camera] @ object_from_camera.T
+        # To second order a turn e also moves it by e x (e x t) / 2: along the ray, where turns are large.
+        bend = (np.trace(spread[camera]) * np.eye(3) - spread[camera]) @ translations[camera] / 2
+        bend *= min(
+            1.0, 2 * float(np.linalg.norm(translations[camera])) / max(float(np.linalg.norm(bend)), 1e-9)
+        )
+        shift = shifts[camera] + np.outer(bend, bend)
+        covariances[camera, :3, :3] += object_from_camera @ shift @ object_from_camera.T
     return np.asarray((covariances + covariances.transpose(0, 2, 1)) / 2)
 
 
@@ -201,7 +230,9 @@ def _joint_spread(
     masses = distributions.masses(calibration.temperature, calibration.flat)
     information = np.zeros((3 * energies.views, 3 * energies.views))
     for pair, (i, j) in enumerate(zip(energies.i.tolist(), energies.j.tolist(), strict=True)):
-        moment = _second_moment(distributions, pair, relative[pair], masses[pair])
+        moment = _second_moment(
+            distributions, pair, relative[pair], _about(distributions, energies, pair, relative, masses)
+        )
         jacobian = np.zeros((3, 3 * energies.views))
         jacobian[:, 3 * i : 3 * i + 3] = -relative[pair].numpy()
         jacobian[:, 3 * j : 3 * j + 3] = np.eye(3)

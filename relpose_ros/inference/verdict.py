@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 TRUSTED = 0.6
 """A pair is trusted when this much of its probability lies within 15 degrees of the final poses: more likely
-right than wrong with a margin, and impossible for a pair with two equal modes."""
+right than wrong with a margin, and impossible for a pair with two equal modes. A chain of pairs is trusted
+when the product of theirs is as much."""
 HARDLY_ANYTHING = 2
 """Percent within 15 degrees below which a number would claim more than is known; uniform has 0.1."""
 LARGEST_DEVIATION = math.radians(12)
@@ -30,7 +31,7 @@ def judge(
 ) -> tuple[Verdict, int, str]:
     """The verdict, the weakest pair's position and the verdict in words.
 
-    ENOUGH asks for three things: a chain of trusted pairs from every camera to the first, a small covariance
+    ENOUGH asks for three things: a trusted chain of pairs from every camera to the first, a small covariance
     of every camera, and calibrated probabilities, without which the first two mean nothing. Views are named
     by their position in the scan, from 0, as in the messages.
 
@@ -54,9 +55,19 @@ def judge(
         reason = "these weights are not calibrated, so that none of their estimates can be called enough"
         return Verdict.ONE_MORE_VIEW, weakest, f"one more view: {reason}"
     loose = [camera for camera, is_tied in enumerate(tied) if not is_tied] or [int(deviations.argmax())]
-    blocking = [p for p, pair in enumerate(pairs) if pair.i in loose or pair.j in loose]
+    # Not the pair that knows least, which may be of two views that show opposite sides: the weak link of the
+    # best chain is what a further view between the two would mend.
+    chains = _chains(pairs, len(covariances))
+    blocking = [p for camera in loose for p in chains[camera]] or list(range(len(pairs)))
     weakest = min(blocking, key=lambda p: _certainty(pairs[p]))
-    return Verdict.ONE_MORE_VIEW, weakest, f"one more view: {_weakness(pairs[weakest])}"
+    reason = _weakness(pairs[weakest])
+    if all(tied):
+        worst = math.degrees(deviations.max())
+        pair = pairs[weakest]
+        reason = (
+            f"rotations are known to about {worst:.0f} degrees only, the weak link is pair {pair.i}-{pair.j}"
+        )
+    return Verdict.ONE_MORE_VIEW, weakest, f"one more view: {reason}"
 
 
 def _certainty(pair: PairRotation) -> float:
@@ -75,11 +86,23 @@ def _weakness(pair: PairRotation) -> str:
     return f"{name} knows its rotation to 15 degrees with {chance:.0f}% only"
 
 
+def _chains(pairs: Sequence[PairRotation], views: int) -> list[list[int]]:
+    """For each camera the pairs that tie it to the first along a maximum spanning tree of their certainty."""
+    chains: list[list[int] | None] = [[], *[None] * (views - 1)]
+    for _ in range(views - 1):
+        ends = [p for p, pair in enumerate(pairs) if (chains[pair.i] is None) != (chains[pair.j] is None)]
+        best = max(ends, key=lambda p: _certainty(pairs[p]))
+        i, j = pairs[best].i, pairs[best].j
+        old, new = (i, j) if chains[j] is None else (j, i)
+        chains[new] = [*(chains[old] or []), best]
+    return [chain or [] for chain in chains]
+
+
 def _tied(pairs: Sequence[PairRotation], views: int) -> list[bool]:
-    """Which cameras a chain of trusted pairs ties to the first."""
-    tied = [camera == 0 for camera in range(views)]
-    for _ in range(views):
+    """Which cameras a chain of pairs ties to the first whose probabilities multiply to what is trusted."""
+    reached = [1.0, *[0.0] * (views - 1)]
+    for _ in range(views - 1):
         for pair in pairs:
-            if pair.solution_probability >= TRUSTED and (tied[pair.i] or tied[pair.j]):
-                tied[pair.i] = tied[pair.j] = True
-    return tied
+            reached[pair.i] = max(reached[pair.i], reached[pair.j] * pair.solution_probability)
+            reached[pair.j] = max(reached[pair.j], reached[pair.i] * pair.solution_probability)
+    return [chance >= TRUSTED for chance in reached]
