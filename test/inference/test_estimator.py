@@ -192,13 +192,27 @@ def ball_errors(rotation_of_ball):
     return errors
 
 
+@pytest.fixture(scope="module")
+def of_ball(network, ball):
+    """Estimates of the ball, each choice of evidence made once."""
+    known = {}
+
+    def estimate(**evidence):
+        chosen = EvidenceSettings(**evidence)
+        if chosen not in known:
+            known[chosen] = Estimator(network, CALIBRATED, chosen).estimate(ball)
+        return known[chosen]
+
+    return estimate
+
+
 def estimated(network, scan, **evidence):
     return Estimator(network, CALIBRATED, EvidenceSettings(**evidence)).estimate(scan)
 
 
-def test_matches_give_the_rotations_that_random_weights_cannot(network, ball, ball_errors):
-    off = estimated(network, ball, use="off")
-    pairs = estimated(network, ball, use="pairs")
+def test_matches_give_the_rotations_that_random_weights_cannot(of_ball, ball_errors):
+    off = of_ball(use="off")
+    pairs = of_ball(use="pairs")
     assert ball_errors(off).max() > 30
     assert ball_errors(pairs).max() < 1.5
     assert [pair.evidence for pair in off.pairs] == [Evidence.LEARNED] * 3
@@ -211,8 +225,8 @@ def test_matches_give_the_rotations_that_random_weights_cannot(network, ball, ba
         assert np.trace(with_matches.covariance[:3, :3]) < 0.2 * np.trace(without.covariance[:3, :3])
 
 
-def test_shared_points_refine_the_poses(network, ball, ball_errors):
-    pairs, refined = (estimated(network, ball, use=use) for use in ("pairs", "refine"))
+def test_shared_points_refine_the_poses(of_ball, ball_errors):
+    pairs, refined = (of_ball(use=use) for use in ("pairs", "refine"))
     assert ball_errors(refined).max() < 0.6
     assert numbers(refined) != numbers(pairs)
     np.testing.assert_allclose(refined.cameras[0].object_from_camera, np.eye(3), atol=1e-12)
@@ -222,7 +236,7 @@ def test_shared_points_refine_the_poses(network, ball, ball_errors):
         np.testing.assert_array_equal(a.covariance, b.covariance)
 
 
-def test_a_refinement_that_contradicts_the_pairs_is_not_taken(network, ball, monkeypatch):
+def test_a_refinement_that_contradicts_the_pairs_is_not_taken(network, ball, of_ball, monkeypatch):
     calls = []
 
     def bent(rotations, translations, *rest):
@@ -233,12 +247,12 @@ def test_a_refinement_that_contradicts_the_pairs_is_not_taken(network, ball, mon
     monkeypatch.setattr(bundle_adjustment, "refine", bent)
     refused = estimated(network, ball, use="refine")
     assert len(calls) == 1
-    assert numbers(refused) == numbers(estimated(network, ball, use="pairs"))
+    assert numbers(refused) == numbers(of_ball(use="pairs"))
 
 
-def test_geometry_alone(network, ball, ball_errors):
+def test_geometry_alone(network, ball, of_ball, ball_errors):
     """The network's rotations are silent: other weights, the same rotations."""
-    alone = estimated(network, ball, use="pairs", learned=False)
+    alone = of_ball(use="pairs", learned=False)
     assert [pair.evidence for pair in alone.pairs] == [Evidence.GEOMETRIC] * 3
     assert ball_errors(alone).max() < 1.5
     other = estimated(random_network("compact", 2), ball, use="pairs", learned=False)
@@ -250,8 +264,8 @@ def test_geometry_alone(network, ball, ball_errors):
     assert nothing.pairs[0].entropy == pytest.approx(0, abs=1e-6)
 
 
-def test_surroundings_mislead_where_the_object_is_what_turns(network, ball, ball_errors):
-    misled = estimated(network, ball, use="pairs", learned=False, surroundings=True)
+def test_surroundings_mislead_where_the_object_is_what_turns(of_ball, ball_errors):
+    misled = of_ball(use="pairs", learned=False, surroundings=True)
     np.testing.assert_allclose(ball_errors(misled), TURNS, atol=2)
 
 
@@ -274,9 +288,9 @@ def test_off_looks_for_no_features(network, ball, monkeypatch):
 
 
 @pytest.mark.parametrize("use", ["off", "refine"])
-def test_a_known_distance_gives_metres(network, ball, use):
-    plain = estimated(network, ball, use=use)
-    metric = estimated(network, ball, use=use, first_view_distance=0.6)
+def test_a_known_distance_gives_metres(of_ball, use):
+    plain = of_ball(use=use)
+    metric = of_ball(use=use, first_view_distance=0.6)
     assert not plain.scale_known
     assert metric.scale_known
     assert np.linalg.norm(metric.cameras[0].position) == pytest.approx(0.6, rel=0.02)
@@ -320,10 +334,9 @@ def test_features_once_a_view_and_matches_once_a_pair(network, ball_on_a_turntab
     assert len(estimator._matcher._features) == 0
 
 
-def test_pair_masses_hold_what_matches_say(network, ball):
-    estimator = Estimator(network, CALIBRATED)
-    estimate = estimator.estimate(ball)
-    for pair, (rotations, masses) in zip(estimate.pairs, estimator.pair_masses(ball), strict=True):
+def test_pair_masses_hold_what_matches_say(network, ball, of_ball):
+    masses_of_pairs = Estimator(network, CALIBRATED).pair_masses(ball)
+    for pair, (rotations, masses) in zip(of_ball().pairs, masses_of_pairs, strict=True):
         assert masses.sum() == pytest.approx(1)
         near = so3.angle_between(rotations, pair.camera_j_from_camera_i) < math.radians(15)
         assert masses[near].sum() == pytest.approx(pair.probability_within_15_deg, abs=0.03)
@@ -331,6 +344,7 @@ def test_pair_masses_hold_what_matches_say(network, ball):
 
 def test_weights_with_evidence(network, tmp_path, ball):
     write_network(network, tmp_path / "plain.safetensors")
-    loaded = Estimator.from_weights(tmp_path / "plain.safetensors", evidence=EvidenceSettings(use="off"))
-    assert loaded.estimate(ball).pairs[0].evidence == Evidence.LEARNED
-    assert Estimator.from_weights(tmp_path / "plain.safetensors").estimate(ball).pairs[0].evidence == 3
+    two = Scan("ball", ball.views[:2])
+    off = Estimator.from_weights(tmp_path / "plain.safetensors", evidence=EvidenceSettings(use="off"))
+    assert off.estimate(two).pairs[0].evidence == Evidence.LEARNED
+    assert Estimator.from_weights(tmp_path / "plain.safetensors").estimate(two).pairs[0].evidence == 3

@@ -126,7 +126,7 @@ def test_energies_with_evidence_have_slopes(fisher_scene, cameras_around):
 
 
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=25)
+@settings(max_examples=20)
 def test_a_sharp_peak_is_found_anywhere(fisher_scene_type, seed):
     """Coarse to fine from 30 degrees down to 0.3."""
     scene_type, cameras_around = fisher_scene_type
@@ -173,7 +173,7 @@ def test_a_sharp_peak_sharpens_what_the_network_knows(fisher_scene, cameras_arou
 
 
 @pytest.mark.parametrize("learned", [True, False])
-@pytest.mark.parametrize("turn", [40.0, 90.0, 180.0])
+@pytest.mark.parametrize("turn", [40.0, 180.0])
 def test_a_wrong_sharp_peak_is_outvoted_over_triplets(fisher_scene, cameras_around, learned, turn):
     """A repetitive texture: matches of one pair fit sharply with a turn that is not the cameras'.
 
