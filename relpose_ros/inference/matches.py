@@ -141,7 +141,8 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
         size = (max(1, round(scale * grey.shape[1])), max(1, round(scale * grey.shape[0])))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
         region = None if region is None else cv2.resize(region, size, interpolation=cv2.INTER_NEAREST)
-    sift: Any = cv2.SIFT.create(nfeatures=MOST_FEATURES, contrastThreshold=CONTRAST)
+    create: Any = vars(cv2)["SIFT_create"]  # in every version, and in no version's type stubs
+    sift = create(nfeatures=MOST_FEATURES, contrastThreshold=CONTRAST)
     points, found = sift.detectAndCompute(grey, region)
     intrinsics, guessed = _intrinsics(view)
     descriptors = np.zeros((0, 128), np.float32) if found is None else found
