@@ -171,6 +171,26 @@ def test_cameras_in_one_place_see_no_depth(point_scene):
     assert refine(scene.rotations, scene.translations, features, geometries(scene, features)) is None
 
 
+def test_what_reprojects_worse_is_not_taken(point_scene, monkeypatch):
+    scene = point_scene.ring(ANGLES)
+    features = scene.features()
+    pairs = geometries(scene, features)
+    worse = perturbed(scene, degrees=1.0)
+    monkeypatch.setattr(bundle_adjustment, "_adjust", lambda *arguments: worse)
+    assert refine(scene.rotations, scene.translations, features, pairs) is None
+
+
+def test_rays_that_are_nearly_parallel_hold_no_point(point_scene):
+    """Three points, each seen by two cameras from directions 0, 1 and 2 degrees apart."""
+    camera, point = np.tile([0, 1], 3), np.repeat(np.arange(3), 2)
+    rays = np.zeros((6, 2))
+    rays[1::2, 0] = np.tan(np.radians([0.0, 1.0, 2.0]))
+    seen = _Observations(camera, point, rays, np.full(6, 1 / 800))
+    poses = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))
+    seen_well = bundle_adjustment._well_seen(poses, seen, np.zeros((3, 3)))
+    assert seen_well.tolist() == [False, False, False, False, True, True]
+
+
 def test_wrong_matches_alone(point_scene):
     scene = point_scene.ring(ANGLES, points=60)
     features = scene.features(outliers=60)

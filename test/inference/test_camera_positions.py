@@ -130,6 +130,16 @@ def test_of_two_cameras_the_distance_stays_unknown():
     assert along == pytest.approx(LOOSE**2, rel=0.01)
 
 
+def test_a_direction_that_points_backwards_is_hardly_believed():
+    rotations, centres = around(2, 5)
+    (only,) = all_baselines(rotations, centres)
+    _, right = place(centres, prior(rotations), [only])
+    found, wrong = place(centres, prior(rotations), [Baseline(0, 1, -only.direction, only.covariance)])
+    np.testing.assert_allclose(found, centres, atol=1e-6)
+    across = np.eye(3) - np.outer(only.direction, only.direction)
+    assert np.trace(across @ wrong[1, :3, :3]) > 10 * np.trace(across @ right[1, :3, :3])
+
+
 def test_a_baseline_points_from_the_first_centre_to_the_second():
     rotations, centres = around(2, 6)
     (only,) = all_baselines(rotations, centres)

@@ -277,6 +277,18 @@ def test_no_match_no_opinion(network):
     )
 
 
+def test_what_the_network_may_be_plainly_wrong_about_is_mixed_in(network):
+    """Half a uniform distribution: a sharp one keeps half of what is near its mode."""
+    sharp, half = (
+        Estimator(network, Calibration(temperature=0.02, flat=flat), EvidenceSettings(use="off"))
+        .estimate(scan(0, 1))
+        .pairs[0]
+        for flat in (0.0, 0.5)
+    )
+    assert half.entropy > sharp.entropy
+    assert half.probability_within_15_deg == pytest.approx(0.5 * sharp.probability_within_15_deg, rel=0.2)
+
+
 def test_off_looks_for_no_features(network, ball, monkeypatch):
     def never(*arguments, **options):
         raise AssertionError

@@ -77,6 +77,19 @@ def test_exact_points_give_the_exact_pose(point_scene):
     assert between(found.poses[0].direction, direction) < 1e-3
 
 
+def test_distances_fall_as_their_derivatives_say(point_scene):
+    """At exact points, where the distance's denominator plays no part."""
+    scene = point_scene.ring([0, 30], points=20)
+    first, second = scene.features(noise=0)
+    together = match(first, second)
+    here = matches._Epipolar(*scene.relative(0, 1), first.rays[together[:, 0]], second.rays[together[:, 1]])
+    distances, jacobian = here.residuals()
+    np.testing.assert_allclose(distances, 0, atol=1e-9)
+    for column, step in enumerate(1e-6 * np.eye(5)):
+        slope = (here.moved(step).residuals()[0] - here.moved(-step).residuals()[0]) / 2e-6
+        np.testing.assert_allclose(jacobian[:, column], slope, atol=1e-5)
+
+
 def test_swapping_the_views_inverts_the_pose(point_scene):
     first, second = point_scene.ring([0, 25]).features(noise=0.3)
     there, back = relate(first, second).poses[0], relate(second, first).poses[0]
@@ -207,6 +220,16 @@ def test_matches_are_mutual_and_distinct():
     assert match(first, second).tolist() == [[0, 2], [1, 1], [3, 0]]
 
 
+def test_of_two_that_resemble_one_the_nearer_matches():
+    generator = np.random.default_rng(1)
+    descriptors = generator.standard_normal((4, 128)).astype(np.float32)
+    descriptors[3] = descriptors[0] + 0.3 * descriptors[3]
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    first = LocalFeatures(np.zeros((3, 2)), descriptors[[3, 0, 1]], 1.0, False)
+    second = LocalFeatures(np.zeros((3, 2)), descriptors[:3], 1.0, False)
+    assert match(first, second).tolist() == [[1, 0], [2, 1]]
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_one_feature_cannot_be_distinct(count):
     none = LocalFeatures(np.zeros((count, 2)), np.ones((count, 128), np.float32), 1.0, False)
@@ -236,6 +259,20 @@ def test_features_lie_where_the_picture_has_them():
     # SIFT itself has a bias of a quarter of a pixel of the picture it was given.
     assert np.abs(shifts).max() < 0.4
     assert abs(shifts[1][1] - shifts[0][1]) < 0.2
+
+
+def test_a_mirrored_picture_has_mirrored_features():
+    """Pixels are counted from the first one's corner: what is at x comes to the width less x."""
+    view = textured(3)
+    mirrored = replace(view, image=np.ascontiguousarray(view.image[:, ::-1]))
+    places, others = (pixels(find_features(each), each) for each in (view, mirrored))
+    others[:, 0] = 200 - others[:, 0]
+    apart = np.linalg.norm(places[:, None] - others[None], axis=-1)
+    near = apart.min(1) < 1.5
+    assert near.sum() > 100
+    error = np.median((places - others[apart.argmin(1)])[near], axis=0) / 2
+    # The picture was enlarged by two, so that SIFT's own bias is an eighth of a pixel.
+    assert -0.03 < error[0] < 0.16
 
 
 def test_features_are_those_of_the_box():
