@@ -175,7 +175,7 @@ def test_what_reprojects_worse_is_not_taken(point_scene, monkeypatch):
     scene = point_scene.ring(ANGLES)
     features = scene.features()
     pairs = geometries(scene, features)
-    worse = perturbed(scene, degrees=1.0)
+    worse = perturbed(scene, degrees=0.1, shift=0.001)
     monkeypatch.setattr(bundle_adjustment, "_adjust", lambda *arguments: worse)
     assert refine(scene.rotations, scene.translations, features, pairs) is None
 
