@@ -60,6 +60,17 @@ class _Found:
     calibration: Calibration
     """Of the sum of energies, which are log-densities as they are."""
 
+    @property
+    def joint_energies(self) -> PairEnergies:
+        """The energies as they add up over a scan.
+
+        Every view takes part in N - 1 pairs, whose errors in the network's eyes go together: beside matches,
+        which err each for themselves, their sum counts N / 2 times too much.
+        """
+        if self.energies.evidence is None:
+            return self.energies
+        return replace(self.energies, weight=2 / self.energies.views)
+
 
 CONTRADICTION = 0.5
 """Nats a pair: refined poses that lose more of the joint energy contradict the pairs, and are not taken."""
@@ -132,7 +143,7 @@ class Estimator:
         with self._lock:
             start = time.perf_counter()
             found = self._search(scan)
-            solutions = solve(found.energies, found.distributions)
+            solutions = solve(found.joint_energies, found.distributions)
             solution = solutions.rotations[0]
             translations = self._network.optical_translations(found.features).double().numpy()
             translations = translations / max(float(np.linalg.norm(translations[0])), 1e-6)

@@ -93,6 +93,8 @@ class PairEnergies:
     """(P,) what makes them a mixture, see `mixed`; None: they are taken as they are."""
     flat: float = 0.0
     """Share of the uniform distribution in that mixture."""
+    weight: float = 1.0
+    """Of the network's part in the sum with the evidence."""
 
     @classmethod
     def of(
@@ -195,10 +197,10 @@ class PairEnergies:
     def _calibrated(self, energies: torch.Tensor, pairs: torch.Tensor | slice) -> torch.Tensor:
         """From the network's energies (Q, K) of some pairs to log-likelihoods."""
         energies = energies / self.temperature
-        if self.log_share is None:
-            return energies
-        uniform = torch.tensor(math.log(self.flat), dtype=energies.dtype)
-        return torch.logaddexp(energies + self.log_share[pairs, None], uniform)
+        if self.log_share is not None:
+            uniform = torch.tensor(math.log(self.flat), dtype=energies.dtype)
+            energies = torch.logaddexp(energies + self.log_share[pairs, None], uniform)
+        return energies * self.weight
 
 
 def _blocks(rows: int, columns: int) -> Iterator[slice]:
