@@ -51,7 +51,7 @@ PLANAR_SHARE = 0.8
 """Of the inliers, explained by one homography: from here on the points may lie on a plane, which two poses
 explain equally well, or the camera may only have turned."""
 TRUST = (-10.4, 3.46, 1.12, -0.57)
-"""Coefficients of `trust`, of the logarithms of the inliers and of their share, and of a plane."""
+"""Coefficients of `trust`: of the logarithms of the inliers and of their share, and of a second explanation."""
 WIDENING = 8.0
 """Factor on a matched rotation's covariance: errors of features near each other go together."""
 FLOOR = math.radians(0.3)
@@ -193,18 +193,20 @@ def relate(first: LocalFeatures, second: LocalFeatures) -> TwoViewGeometry:
         return NOTHING
     if first.guessed or second.guessed:
         poses = tuple(_widened(pose) for pose in poses)
-    probability = trust(int(inside.sum()), len(matches), planar=planar)
+    probability = trust(int(inside.sum()), len(matches), several=len(poses) > 1)
     return TwoViewGeometry(poses, matches[inside], probability)
 
 
-def trust(inliers: int, matches: int, *, planar: bool) -> float:
+def trust(inliers: int, matches: int, *, several: bool) -> float:
     """Probability that the pose of a pair is right, learned from pairs whose pose is known.
 
     Logistic in the logarithms of the inliers and of their share of the matches
-    (`relpose_ros.evaluation.match_trust` fits it and says on what).
+    (`benchmarks/match_trust.py` fits it, here on the training captures).
     """
-    bias, of_inliers, of_share, of_plane = TRUST
-    score = bias + of_inliers * math.log(inliers) + of_share * math.log(inliers / matches) + of_plane * planar
+    bias, of_inliers, of_share, of_several = TRUST
+    score = (
+        bias + of_inliers * math.log(inliers) + of_share * math.log(inliers / matches) + of_several * several
+    )
     return 0.995 / (1 + math.exp(-score))
 
 

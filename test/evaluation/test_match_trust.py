@@ -71,7 +71,9 @@ def test_observes_the_pairs_whose_cameras_are_known(capture):
     # By the same predictors the matches say how far to trust themselves.
     log_inliers, log_share, _ = pairs.predictors[0]
     inliers = round(math.exp(log_inliers))
-    stated = {trust(inliers, round(inliers / math.exp(log_share)), planar=planar) for planar in (False, True)}
+    stated = {
+        trust(inliers, round(inliers / math.exp(log_share)), several=planar) for planar in (False, True)
+    }
     assert found.probability in stated
 
 

@@ -1,0 +1,55 @@
+"""How far matches are to be trusted: the constants of `relpose_ros.inference.matches`, fitted on captures.
+
+    python -m benchmarks.match_trust CAPTURE... [--boxes]
+
+Matches all pairs of each capture's photographs whose pose is known, with their masks where there are some.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from relpose_ros.captures.folder import load_capture
+from relpose_ros.evaluation.match_trust import MatchedPairs, fit_trust, observe
+
+FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0)
+FLOORS_DEG = (0.1, 0.2, 0.3, 0.5, 0.7)
+
+
+def log_likelihood(pairs: MatchedPairs, factor: float, floor_deg: float, freedom: float = 4.0) -> float:
+    """Mean over the right pairs of the log density of their error, Student's t, but for a constant."""
+    covariances = factor * pairs.covariances + np.radians(floor_deg) ** 2 * np.eye(3)
+    solved = np.linalg.solve(covariances, pairs.errors[..., None])[..., 0]
+    squares = (pairs.errors * solved).sum(1)
+    tails = -(freedom + 3) / 2 * np.log1p(squares / freedom)
+    return float(np.mean(tails - np.linalg.slogdet(covariances).logabsdet / 2))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("captures", type=Path, nargs="*", help="capture folders with poses")
+    parser.add_argument("--boxes", action="store_true", help="leave masks aside")
+    arguments = parser.parse_args()
+    if not arguments.captures:
+        print("Nothing to fit: name captures with poses.")
+        return
+    parts = [observe(load_capture(each), masked=not arguments.boxes) for each in tqdm(arguments.captures)]
+    pairs = MatchedPairs(
+        *(np.concatenate(column) for column in zip(*(vars(p).values() for p in parts), strict=True))
+    )
+    print(f"{len(pairs.right)} matched pairs, {pairs.right.mean():.0%} right")
+    print("TRUST =", tuple(float(value) for value in fit_trust(pairs).round(2)))
+    print("log likelihood of the errors, by factor (down) and floor in degrees (across)")
+    print(" " * 6 + "".join(f"{floor:8.1f}" for floor in FLOORS_DEG))
+    for factor in FACTORS:
+        print(f"{factor:6.0f}" + "".join(f"{log_likelihood(pairs, factor, f):8.2f}" for f in FLOORS_DEG))
+
+
+if __name__ == "__main__":
+    main()
