@@ -51,7 +51,7 @@ PLANAR_SHARE = 0.8
 """Of the inliers, explained by one homography: from here on the points may lie on a plane, which two poses
 explain equally well, or the camera may only have turned."""
 TRUST = (-10.4, 3.46, 1.12, -0.57)
-"""Coefficients of `trust`: of the logarithms of the inliers and of their share, and of a second explanation."""
+"""Coefficients of `trust`: of the logarithms of the inliers and of their share, of a second explanation."""
 WIDENING = 8.0
 """Factor on a matched rotation's covariance: errors of features near each other go together."""
 FLOOR = math.radians(0.3)

@@ -72,7 +72,7 @@ def test_observes_the_pairs_whose_cameras_are_known(capture):
     log_inliers, log_share, _ = pairs.predictors[0]
     inliers = round(math.exp(log_inliers))
     stated = {
-        trust(inliers, round(inliers / math.exp(log_share)), several=planar) for planar in (False, True)
+        trust(inliers, round(inliers / math.exp(log_share)), several=several) for several in (False, True)
     }
     assert found.probability in stated
 

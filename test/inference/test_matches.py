@@ -367,9 +367,9 @@ def test_a_static_background_takes_no_part(ball_on_a_turntable, rotation_of_ball
 
 
 def test_trust_grows_with_inliers_and_their_share():
-    assert trust(100, 120, several=False) > trust(30, 120, planar=False) > trust(10, 120, planar=False)
-    assert trust(30, 40, several=False) > trust(30, 120, planar=False)
-    assert trust(30, 40, several=False) > trust(30, 40, planar=True)
+    assert trust(100, 120, several=False) > trust(30, 120, several=False) > trust(10, 120, several=False)
+    assert trust(30, 40, several=False) > trust(30, 120, several=False)
+    assert trust(30, 40, several=False) > trust(30, 40, several=True)
     assert 0 < trust(8, 2000, several=True) < 0.01
     assert trust(2000, 2000, several=False) < 1
 
