@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from relpose_ros.estimates import ScanEstimate
     from relpose_ros.views import View
 
-USES = ("off", "pairs", "refine")
+USES = ("network", "pairs", "refine")
 
 
 class Listener:
@@ -69,7 +69,7 @@ def main() -> None:
     network = load_network(None)
     calibration = Calibration.from_json(read_metadata(None)["calibration"])
     views = views_of(arguments.bag, Estimator(network, calibration))
-    print(f"{'':2}  {'all views new, s (over off)':^40}  {'one view more, s (over off)':^40}")
+    print(f"{'':2}  {'all views new, s (over network)':^40}  {'one view more, s (over network)':^40}")
     print(f"{'N':>2}  {''.join(f'{use:>13}' for use in USES * 2)}")
     for count in tqdm(range(MIN_VIEWS, len(views) + 1), leave=False):
         least = {use: [float("inf")] * 2 for use in USES}
@@ -83,7 +83,7 @@ def main() -> None:
                 times = whole, seconds(estimator, newcomer)
                 least[use] = [min(pair) for pair in zip(least[use], times, strict=True)]
         cells = [
-            f"{least[use][which]:6.2f} ({least[use][which] / least['off'][which]:3.1f}x)".rjust(13)
+            f"{least[use][which]:6.2f} ({least[use][which] / least['network'][which]:3.1f}x)".rjust(13)
             for which in range(2)
             for use in USES
         ]

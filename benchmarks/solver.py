@@ -129,7 +129,7 @@ def rows(name: str, repeats: int, scale: float) -> None:
         for kind in ("contradict", "agree"):
             if kind == "agree":
                 network.layers[4].weight *= 0.01
-            estimator = Estimator(network, evidence=EvidenceSettings(use="off"))
+            estimator = Estimator(network, evidence=EvidenceSettings(use="network"))
             estimator.estimate(Scan("warm-up", tuple(fresh(views))))
             totals = []
             for count in counts:

@@ -36,7 +36,7 @@ learned the matches too, geometry the network."""
 EVIDENCE = {
     "relpose": EvidenceSettings("refine"),
     "both": EvidenceSettings("pairs"),
-    "learned": EvidenceSettings("off"),
+    "learned": EvidenceSettings("network"),
     "geometry": EvidenceSettings("pairs", learned=False),
 }
 """What the estimator rests on in each of these methods."""

@@ -100,7 +100,7 @@ class Estimator:
         self._network = network.eval()
         self._calibration = calibration
         self._evidence = evidence
-        self._matcher = None if evidence.use == "off" else Matcher(surroundings=evidence.surroundings)
+        self._matcher = None if evidence.use == "network" else Matcher(surroundings=evidence.surroundings)
         self._grid = GridEmbeddings(network)
         self._looks: WeakKeyDictionary[View, tuple[ViewFeatures, torch.Tensor]] = WeakKeyDictionary()
         self._lock = threading.Lock()
@@ -199,6 +199,7 @@ class Estimator:
         features = self._features(scan)
         calibration = self._calibration or Calibration()
         geometries = {} if self._matcher is None else self._matcher.geometries(scan.views)
+        spoken = [peaks(each) for each in geometries.values()]
         # The temperature belongs to the network's energies, not to what is added to them.
         temperature = calibration.temperature if self._evidence.learned else math.inf
         energies = PairEnergies.of(
@@ -206,7 +207,7 @@ class Estimator:
             features,
             len(features),
             temperature,
-            RotationEvidence([peaks(each) for each in geometries.values()]) if geometries else None,
+            RotationEvidence(spoken) if any(spoken) else None,
         )
         if calibration.flat > 0:
             energies = energies.mixed(self._grid, calibration.flat)

@@ -10,9 +10,9 @@ from typing import Literal
 class EvidenceSettings:
     """Which evidence joins the network's, and what is known of the scale."""
 
-    use: Literal["off", "pairs", "refine"] = "refine"
-    """``pairs``: matched local features join the pairs' energies and the camera positions. ``refine``: then a
-    bundle adjustment where views share points."""
+    use: Literal["network", "pairs", "refine"] = "refine"
+    """``network``: nothing beside it. ``pairs``: matched local features join the pairs' energies and the
+    camera positions. ``refine``: then a bundle adjustment where views share points."""
     surroundings: bool = False
     """Whether features outside the object's box and mask take part."""
     learned: bool = True

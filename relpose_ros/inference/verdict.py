@@ -20,8 +20,13 @@ TRUSTED = 0.6
 """A pair is trusted when this much of its probability lies within 15 degrees of the final poses: more likely
 right than wrong with a margin, and impossible for a pair with two equal modes. A chain of pairs is trusted
 when the product of theirs is as much."""
+CHECKED = 2
+"""Trusted pairs that every camera needs: a single one, however sure, has nothing to be checked against, so
+that two views are never enough."""
 HARDLY_ANYTHING = 2
 """Percent within 15 degrees below which a number would claim more than is known; uniform has 0.1."""
+CONTRADICTION = math.radians(10)
+"""From this angle on between a pair's own rotation and the final poses' the two disagree."""
 LARGEST_DEVIATION = math.radians(12)
 """Largest standard deviation (worst axis) of a camera's rotation: within 15 degrees more often than not."""
 
@@ -31,9 +36,10 @@ def judge(
 ) -> tuple[Verdict, int, str]:
     """The verdict, the weakest pair's position and the verdict in words.
 
-    ENOUGH asks for three things: a trusted chain of pairs from every camera to the first, a small covariance
-    of every camera, and calibrated probabilities, without which the first two mean nothing. Views are named
-    by their position in the scan, from 0, as in the messages.
+    ENOUGH asks for four things: a trusted chain of pairs from every camera to the first; a second trusted
+    pair of every camera, by which the first is checked; a small covariance of every camera; and calibrated
+    probabilities, without which the others mean nothing. Views are named by their position in the scan, from
+    0, as in the messages.
 
     Args:
         pairs: of all N views.
@@ -42,15 +48,21 @@ def judge(
     """
     deviations = np.sqrt(np.linalg.eigvalsh(covariances[:, 3:, 3:])[:, -1])
     tied = _tied(pairs, len(covariances))
+    trusted = [pair for pair in pairs if pair.solution_probability >= TRUSTED]
+    ties = np.bincount([view for pair in trusted for view in (pair.i, pair.j)], minlength=len(covariances))
+    if all(tied) and ties.min() < CHECKED:
+        camera = int(ties.argmin())
+        own = [p for p, pair in enumerate(pairs) if camera in (pair.i, pair.j) and pair in trusted]
+        reason = f"view {camera} hangs on one pair, which no other pair checks"
+        return Verdict.ONE_MORE_VIEW, own[0], f"one more view: {reason}"
     if all(tied) and deviations.max() <= LARGEST_DEVIATION:
         weakest = min(range(len(pairs)), key=lambda p: _certainty(pairs[p]))
         if calibrated:
-            trusted = sum(pair.solution_probability >= TRUSTED for pair in pairs)
             worst = math.degrees(deviations.max())
             return (
                 Verdict.ENOUGH,
                 weakest,
-                f"enough: {trusted} of {len(pairs)} pairs agree, rotations to about {worst:.0f} degrees",
+                f"enough: {len(trusted)} of {len(pairs)} pairs agree, rotations to about {worst:.0f} degrees",
             )
         reason = "these weights are not calibrated, so that none of their estimates can be called enough"
         return Verdict.ONE_MORE_VIEW, weakest, f"one more view: {reason}"
@@ -78,6 +90,8 @@ def _weakness(pair: PairRotation) -> str:
     name = f"pair {pair.i}-{pair.j}"
     if pair.ambiguous:
         return f"{name} is ambiguous by about {10 * round(math.degrees(pair.ambiguity_angle) / 10)} degrees"
+    if pair.probability_within_15_deg >= TRUSTED and pair.solution_angle < CONTRADICTION:
+        return f"the chain of pairs is long, and {name} is its weak link"
     if pair.probability_within_15_deg >= TRUSTED:
         return f"{name} contradicts the others by about {math.degrees(pair.solution_angle):.0f} degrees"
     chance = 100 * pair.probability_within_15_deg

@@ -108,10 +108,11 @@ class ScanSettings:
     )
     evidence: str = _setting(
         "refine",
-        "What joins the network. off: nothing. pairs: local features that match between two views speak for "
-        "the pair's rotation and for the direction between the cameras. refine: where views share such "
-        "points, a bundle adjustment then makes the poses exact. Matching costs a third of a second a view.",
-        choices=("off", "pairs", "refine"),
+        "What an estimate rests on. network: the network alone. pairs: local features that match between two "
+        "views speak for the pair's rotation and for the direction between the cameras. refine: where views "
+        "share such points, a bundle adjustment then makes the poses exact. Matching costs a third of a "
+        "second a view.",
+        choices=("network", "pairs", "refine"),
     )
     surroundings: bool = _setting(
         False,

@@ -211,7 +211,7 @@ def estimated(network, scan, **evidence):
 
 
 def test_matches_give_the_rotations_that_random_weights_cannot(of_ball, ball_errors):
-    off = of_ball(use="off")
+    off = of_ball(use="network")
     pairs = of_ball(use="pairs")
     assert ball_errors(off).max() > 30
     assert ball_errors(pairs).max() < 1.5
@@ -259,7 +259,7 @@ def test_geometry_alone(network, ball, of_ball, ball_errors):
     assert [pair.entropy for pair in other.pairs] == pytest.approx([pair.entropy for pair in alone.pairs])
     for a, b in zip(alone.cameras, other.cameras, strict=True):
         assert math.degrees(so3.angle_between(a.object_from_camera, b.object_from_camera)) < 0.1
-    nothing = estimated(network, scan(0, 1), use="off", learned=False)
+    nothing = estimated(network, scan(0, 1), use="network", learned=False)
     assert nothing.pairs[0].evidence == Evidence(0)
     assert nothing.pairs[0].entropy == pytest.approx(0, abs=1e-6)
 
@@ -272,7 +272,7 @@ def test_surroundings_mislead_where_the_object_is_what_turns(of_ball, ball_error
 def test_no_match_no_opinion(network):
     """Pictures that share nothing: to the bit what the network alone says."""
     strangers = scan(0, 1, 2)
-    assert numbers(estimated(network, strangers, use="off")) == numbers(
+    assert numbers(estimated(network, strangers, use="network")) == numbers(
         estimated(network, strangers, use="refine")
     )
 
@@ -280,7 +280,7 @@ def test_no_match_no_opinion(network):
 def test_what_the_network_may_be_plainly_wrong_about_is_mixed_in(network):
     """Half a uniform distribution: a sharp one keeps half of what is near its mode."""
     sharp, half = (
-        Estimator(network, Calibration(temperature=0.02, flat=flat), EvidenceSettings(use="off"))
+        Estimator(network, Calibration(temperature=0.02, flat=flat), EvidenceSettings(use="network"))
         .estimate(scan(0, 1))
         .pairs[0]
         for flat in (0.0, 0.5)
@@ -294,12 +294,12 @@ def test_off_looks_for_no_features(network, ball, monkeypatch):
         raise AssertionError
 
     monkeypatch.setattr(matches, "find_features", never)
-    estimated(network, ball, use="off")
+    estimated(network, ball, use="network")
     with pytest.raises(AssertionError):
         estimated(network, ball, use="pairs")
 
 
-@pytest.mark.parametrize("use", ["off", "refine"])
+@pytest.mark.parametrize("use", ["network", "refine"])
 def test_a_known_distance_gives_metres(of_ball, use):
     plain = of_ball(use=use)
     metric = of_ball(use=use, first_view_distance=0.6)
@@ -357,6 +357,6 @@ def test_pair_masses_hold_what_matches_say(network, ball, of_ball):
 def test_weights_with_evidence(network, tmp_path, ball):
     write_network(network, tmp_path / "plain.safetensors")
     two = Scan("ball", ball.views[:2])
-    off = Estimator.from_weights(tmp_path / "plain.safetensors", evidence=EvidenceSettings(use="off"))
+    off = Estimator.from_weights(tmp_path / "plain.safetensors", evidence=EvidenceSettings(use="network"))
     assert off.estimate(two).pairs[0].evidence == Evidence.LEARNED
     assert Estimator.from_weights(tmp_path / "plain.safetensors").estimate(two).pairs[0].evidence == 3

@@ -163,13 +163,25 @@ def test_the_verdict_names_the_ambiguous_pair(fisher_scene, cameras_around):
 
 
 def test_a_chain_of_good_pairs_is_enough(fisher_scene, cameras_around):
-    """Pair 0-2 says nothing, and need not: 0-1 and 1-2 do."""
-    scene = fisher_scene(cameras_around(3, 8), concentration=300.0)
+    """Pair 0-2 says nothing, and need not: others tie both views."""
+    scene = fisher_scene(cameras_around(4, 8), concentration=300.0)
     scene.mixtures[0, 2] = [(np.eye(3), 0.0, 0.0)]
     pairs, covariances, _ = told(scene)
     verdict, weakest, _ = judge(pairs, covariances, calibrated=True)
     assert verdict is Verdict.ENOUGH
     assert (pairs[weakest].i, pairs[weakest].j) == (0, 2)
+
+
+def test_a_pair_that_nothing_checks_is_not_enough(fisher_scene, cameras_around):
+    pairs, covariances, _ = told(fisher_scene(cameras_around(2, 8), concentration=300.0))
+    verdict, weakest, words = judge(pairs, covariances, calibrated=True)
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert weakest == 0
+    assert words == "one more view: view 0 hangs on one pair, which no other pair checks"
+    scene = fisher_scene(cameras_around(3, 8), concentration=300.0)
+    scene.mixtures[0, 2] = [(np.eye(3), 0.0, 0.0)]
+    pairs, covariances, _ = told(scene)
+    assert judge(pairs, covariances, calibrated=True)[0] is Verdict.ONE_MORE_VIEW
 
 
 def test_contradicting_pairs_are_not_enough(fisher_scene, cameras_around):
