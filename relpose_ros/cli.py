@@ -214,6 +214,18 @@ def _parser() -> argparse.ArgumentParser:
         metavar="K",
         help="processes beside it that prepare batches (default: 0)",
     )
+    train.add_argument(
+        "--start-from",
+        type=_home_path,
+        metavar="FILE",
+        help="weights of the same network to begin with; the images they have seen count towards --images",
+    )
+    train.add_argument(
+        "--compile",
+        action="store_true",
+        dest="compiled",
+        help="compile the step first: minutes, for about half as many images again a second",
+    )
     train.add_argument("--seed", type=int, default=0, help="of the run (default: 0)")
 
     convert = command(
@@ -365,7 +377,14 @@ def _train(arguments: argparse.Namespace) -> int:
     held_out = open_scans(arguments.held_out) if arguments.held_out else None
     scans = open_scans(arguments.scans)
     trainer = Trainer(
-        settings, arguments.run_folder, scans, held_out, device=arguments.device, workers=arguments.workers
+        settings,
+        arguments.run_folder,
+        scans,
+        held_out,
+        device=arguments.device,
+        workers=arguments.workers,
+        start_from=arguments.start_from,
+        compiled=arguments.compiled,
     )
     trainer.run(arguments.budget)
     return 0

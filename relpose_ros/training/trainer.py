@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from relpose_ros.errors import RelPoseError
 from relpose_ros.geometry import so3, so3_grid
-from relpose_ros.network.checkpoint import random_network, write_network
+from relpose_ros.network.checkpoint import load_network, random_network, read_metadata, write_network
 from relpose_ros.network.presets import named_preset
 from relpose_ros.training.batches import Augmentation, Scans, make_batch
 from relpose_ros.training.objective import Batch, Objective, ObjectiveSettings, Targets, make_targets
@@ -133,6 +133,8 @@ class Trainer:
         *,
         device: str = "cpu",
         workers: int = 0,
+        start_from: Path | None = None,
+        compiled: bool = False,
     ) -> None:
         """Begin a run, or go on with the one in the folder.
 
@@ -145,9 +147,13 @@ class Trainer:
             held_out: To measure on, other objects.
             device: Of this process; "cuda" alone is, under torchrun, each process's own GPU.
             workers: Processes beside this one that prepare batches; what they prepare does not depend on it.
+            start_from: Weights of this network to begin with; the images they have seen count as seen. A run
+                that has a checkpoint goes on with that.
+            compiled: Whether to compile the step first: minutes, for half as many images again afterwards.
 
         Raises:
-            TrainingError: The checkpoint is damaged or of another network.
+            TrainingError: The checkpoint is damaged, or it or the weights are of another network.
+            NetworkFileError: The weights cannot be read.
         """
         self.settings = settings
         self.folder = folder
@@ -176,11 +182,16 @@ class Trainer:
         if self._processes > 1:
             # Ablations leave parts of the network unused.
             self._objective = DistributedDataParallel(objective, find_unused_parameters=True)
+        if compiled:
+            self._objective.compile()
         self.step = 0
         self.images = 0
+        self._began = 0
         self._seconds = 0.0
         if (folder / "checkpoint.json").exists():
             self._resume()
+        elif start_from is not None:
+            self._begin_with(start_from)
 
     @property
     def finished(self) -> bool:
@@ -246,8 +257,10 @@ class Trainer:
         self.step += 1
         seen = batch.images.shape[0] * batch.images.shape[1] * self._processes
         self.images += seen
-        # Young weights are forgotten sooner, or the average would keep the random ones.
-        keep = min(self.step / (self.step + 10), float(np.exp(-seen / settings.average_images)))
+        keep = float(np.exp(-seen / settings.average_images))
+        if not self._began:
+            # Young weights are forgotten sooner, or the average would keep the random ones.
+            keep = min(self.step / (self.step + 10), keep)
         with torch.no_grad():
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - keep)
         return losses.detach()
@@ -255,7 +268,7 @@ class Trainer:
     def learning_rate(self) -> float:
         """Of the coming step: a linear rise, a plateau, a linear fall to 0."""
         s = self.settings
-        rise = min(1.0, (self.images + s.batch_images) / max(s.warmup_images, 1))
+        rise = min(1.0, (self.images - self._began + s.batch_images) / max(s.warmup_images, 1))
         left = 1 - self.images / s.images
         return s.learning_rate * rise * (min(1.0, left / s.decay) if s.decay > 0 else 1.0)
 
@@ -279,6 +292,7 @@ class Trainer:
                 "scaler": self._scaler.state_dict(),
                 "step": self.step,
                 "images": self.images,
+                "began": self._began,
                 "seconds": self._seconds,
                 "preset": asdict(self.settings.network),
             }
@@ -297,9 +311,9 @@ class Trainer:
         state = load_pieces(self.folder)
         # As JSON a tuple and a list are the same.
         if json.dumps(state["preset"]) != json.dumps(asdict(self.settings.network)):
-            asked = " + ".join([self.settings.preset, *self.settings.variants])
             text = (
-                f"the checkpoint in {self.folder} is of another network than '{asked}'; name another folder."
+                f"the checkpoint in {self.folder} is of another network than {self._asked()}; "
+                "name another folder."
             )
             raise TrainingError(text)
         self.network.load_state_dict(state["network"])
@@ -307,8 +321,21 @@ class Trainer:
         self._optimizer.load_state_dict(state["optimizer"])
         self._scaler.load_state_dict(state["scaler"])
         self.step, self.images, self._seconds = state["step"], state["images"], state["seconds"]
+        self._began = state.get("began", 0)
         if self._rank == 0:
             _cut_curve(self.folder / CURVE, self.step)
+
+    def _begin_with(self, weights: Path) -> None:
+        begun = load_network(weights)
+        if begun.preset != self.settings.network:
+            text = f"{weights} holds another network than {self._asked()}; name its preset and variants."
+            raise TrainingError(text)
+        for network in (self.network, self.average):
+            network.load_state_dict(begun.state_dict())
+        self.images = self._began = int(read_metadata(weights).get("images_seen", "0"))
+
+    def _asked(self) -> str:
+        return "'" + " + ".join([self.settings.preset, *self.settings.variants]) + "'"
 
     def _next_batch(self) -> tuple[Batch, Targets]:
         if self._batches is None:

@@ -76,6 +76,31 @@ def test_time_that_is_up_leaves_a_checkpoint_and_weights(tmp_path, scans):
     assert metadata["images_seen"] == "0"
 
 
+def test_a_run_begins_with_the_weights_it_is_given_and_counts_on(tmp_path, scans):
+    first = Trainer(replace(SETTINGS, images=80), tmp_path / "first", scans)
+    first.run(progress=False)
+    given = tmp_path / "first" / trainer.WEIGHTS
+    second = Trainer(replace(SETTINGS, seed=1), tmp_path / "second", scans, start_from=given)
+    assert weights(second.network).equal(weights(first.average))
+    assert second.images == first.images >= 80
+    assert second.learning_rate() == pytest.approx(SETTINGS.learning_rate / 2)  # the optimizer is new
+    second.train_step()
+    moved = weights(second.average) - weights(first.average)
+    # What was given is not forgotten as random weights are.
+    assert 0 < moved.norm() < 0.01 * (weights(second.network) - weights(first.average)).norm()
+    second.save()
+    resumed = Trainer(replace(SETTINGS, seed=1), tmp_path / "second", scans, start_from=given)
+    assert resumed.images == second.images
+    assert resumed.learning_rate() == second.learning_rate()
+    assert int(read_metadata(tmp_path / "second" / trainer.WEIGHTS)["images_seen"]) == second.images
+
+
+def test_weights_of_another_network_begin_no_run(tmp_path, scans):
+    Trainer(replace(SETTINGS, variants=("no-index",)), tmp_path / "first", scans).save()
+    with pytest.raises(TrainingError, match=r"weights\.safetensors holds another network than 'tiny'"):
+        Trainer(SETTINGS, tmp_path / "second", scans, start_from=tmp_path / "first" / trainer.WEIGHTS)
+
+
 def test_it_learns_a_handful_of_scans(tmp_path, fake_shard):
     settings = replace(
         SETTINGS,
