@@ -100,7 +100,7 @@ class Estimator:
         self._network = network.eval()
         self._calibration = calibration
         self._evidence = evidence
-        self._matcher = None if evidence.use == "network" else Matcher(surroundings=evidence.surroundings)
+        self._matcher = _matcher(evidence)
         self._grid = GridEmbeddings(network)
         self._looks: WeakKeyDictionary[View, tuple[ViewFeatures, torch.Tensor]] = WeakKeyDictionary()
         self._lock = threading.Lock()
@@ -127,6 +127,12 @@ class Estimator:
         network = load_network(path)
         stored = read_metadata(path).get("calibration")
         return cls(network, Calibration.from_json(stored) if stored else None, evidence)
+
+    def rest_on(self, evidence: EvidenceSettings) -> None:
+        """Goes on with other evidence from the next estimate on."""
+        with self._lock:
+            if evidence != self._evidence:
+                self._evidence, self._matcher = evidence, _matcher(evidence)
 
     @torch.no_grad()
     def estimate(self, scan: Scan) -> ScanEstimate:
@@ -264,3 +270,7 @@ class Estimator:
             looks.append(self._looks[view])
         stacked = torch.stack([crop_parameters for _, crop_parameters in looks])
         return self._network.relate(ViewFeatures.stack([look for look, _ in looks]), stacked)
+
+
+def _matcher(evidence: EvidenceSettings) -> Matcher | None:
+    return None if evidence.use == "network" else Matcher(surroundings=evidence.surroundings)

@@ -299,6 +299,18 @@ def test_off_looks_for_no_features(network, ball, monkeypatch):
         estimated(network, ball, use="pairs")
 
 
+def test_other_evidence_from_the_next_estimate_on(network, ball, of_ball):
+    changing = Estimator(network, CALIBRATED, EvidenceSettings("network"))
+    for chosen in (
+        {"use": "pairs"},
+        {"use": "refine"},
+        {"use": "pairs", "surroundings": True},
+        {"use": "network"},
+    ):
+        changing.rest_on(EvidenceSettings(**chosen))
+        assert numbers(changing.estimate(ball)) == numbers(of_ball(**chosen)), chosen
+
+
 @pytest.mark.parametrize("use", ["network", "refine"])
 def test_a_known_distance_gives_metres(of_ball, use):
     plain = of_ball(use=use)
