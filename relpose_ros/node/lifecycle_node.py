@@ -34,8 +34,21 @@ from visualization_msgs.msg import MarkerArray
 
 from relpose_ros.errors import RelPoseError
 from relpose_ros.msg import ObjectView, ScanEstimate
-from relpose_ros.node.parameters import changed_settings, declare_parameters
-from relpose_ros.node.reports import NodeHealth, Throttle, diagnostic_status, loss_advice, qos_advice
+from relpose_ros.node.parameters import (
+    FORTH,
+    changed_settings,
+    declare_parameters,
+    lifecycle,
+    unknown_parameters,
+)
+from relpose_ros.node.reports import (
+    NodeHealth,
+    Throttle,
+    diagnostic_status,
+    loss_advice,
+    pairing_advice,
+    qos_advice,
+)
 from relpose_ros.scanning.scanner import Scanner
 from relpose_ros.scanning.settings import SettingsError
 
@@ -44,7 +57,8 @@ if TYPE_CHECKING:
 
     from rclpy.parameter import Parameter
 
-    from relpose_ros.scanning.scanner import Kind, Result, SupportsEstimate
+    from relpose_ros.inference.estimator import Estimator
+    from relpose_ros.scanning.scanner import Kind, Result, Statistics
 
     Transition: TypeAlias = Callable[["ScanNode", LifecycleState], TransitionCallbackReturn]
 
@@ -52,6 +66,8 @@ BURST = 50
 """Messages that a subscription keeps while the callbacks are busy with others."""
 LOSS_REPEAT_AFTER_S = 60.0
 """Lost messages are told this often: a scan can do with some of a camera's frames."""
+UNPAIRED_AFTER_S = 2.0
+"""A camera info that is this late will not come."""
 
 INPUTS: tuple[tuple[Kind, str, Any, str], ...] = (
     ("object_view", "object_view", ObjectView, ""),
@@ -59,6 +75,7 @@ INPUTS: tuple[tuple[Kind, str, Any, str], ...] = (
     ("compressed", "image/compressed", CompressedImage, "compressed"),
 )
 """Kind, topic, type, and the image transport that must be asked for (empty: always there)."""
+CAMERA_INFO: tuple[Kind, str, Any] = ("camera_info", "camera_info", CameraInfo)
 
 OUTPUTS: tuple[tuple[str, Any], ...] = (
     ("~/estimate", ScanEstimate),
@@ -78,6 +95,7 @@ RESULT_QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,  # with transient local: matches every subscription
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
+DIAGNOSTICS_TOPIC = "/diagnostics"
 DIAGNOSTICS_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10)
 OVERRIDABLE = QoSOverridingOptions(
     (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
@@ -116,7 +134,9 @@ class ScanNode(LifecycleNode):
         self.in_transition = threading.RLock()
         super().__init__("scan_node", **kwargs)
         self._settings = declare_parameters(self)
+        self._ignored = self._tell_unknown_parameters()
         self._scanner: Scanner | None = None
+        self._estimator: Estimator | None = None
         self._worker: ThreadPoolExecutor | None = None
         self._jobs: set[Future[Any]] = set()
         self._jobs_lock = threading.Lock()
@@ -135,13 +155,14 @@ class ScanNode(LifecycleNode):
         self._lost: dict[str, int] = {}
         self._throttle = Throttle()
         self._loss_throttle = Throttle(LOSS_REPEAT_AFTER_S)
+        self._unpaired = ""
         # A service that waits for an estimate must not hold up the callbacks of images.
         self._waiting_group = MutuallyExclusiveCallbackGroup()
         self._diagnostics = self.create_publisher(
-            DiagnosticArray, "/diagnostics", copy(DIAGNOSTICS_QOS), qos_overriding_options=OVERRIDABLE
+            DiagnosticArray, DIAGNOSTICS_TOPIC, copy(DIAGNOSTICS_QOS), qos_overriding_options=OVERRIDABLE
         )
-        self._diagnostics_timer: Any = None
-        self._set_diagnostics_timer()
+        self._health_timer: Any = None
+        self._set_health_timer()
         change_state = self._service_change_state
         change_state.callback = functools.partial(self._on_change_state, change_state.callback)
         self.add_on_set_parameters_callback(self._judge_parameters)
@@ -186,11 +207,13 @@ class ScanNode(LifecycleNode):
             estimator = self._load_estimator()
         except (RelPoseError, OSError) as err:
             self._failure = str(err)
-            self.get_logger().error(f"{err} Set the parameter weights and configure the node again.")
+            name = self.get_fully_qualified_name()
+            how = f"`ros2 param set {name} weights FILE`, {lifecycle(name, *FORTH)}"
+            self.get_logger().error(f"{err} Then, or with other weights: {how}.")
             return TransitionCallbackReturn.FAILURE
         if self._closing:
             return TransitionCallbackReturn.FAILURE
-        self._scanner = Scanner(estimator, self._settings)
+        self._estimator, self._scanner = estimator, Scanner(estimator, self._settings)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="estimate")
         self._make_outputs()
         self._make_inputs(self._scanner)
@@ -246,7 +269,7 @@ class ScanNode(LifecycleNode):
 
     # What configuring makes.
 
-    def _load_estimator(self) -> SupportsEstimate:
+    def _load_estimator(self) -> Estimator:
         weights, threads = self._settings.weights_path, self._settings.threads
         self.get_logger().info(f"Loading {weights or 'the shipped weights'}.")
         # Imported here, as is all that needs PyTorch: that takes seconds, in which a signal must be heard.
@@ -271,7 +294,7 @@ class ScanNode(LifecycleNode):
     def _make_inputs(self, scanner: Scanner) -> None:
         transports = self._settings.image_transports
         wanted = [each[:3] for each in INPUTS if not each[3] or each[3] in transports]
-        for kind, name, message_type in [*wanted, ("camera_info", "camera_info", CameraInfo)]:
+        for kind, name, message_type in [*wanted, CAMERA_INFO]:
             topic = self.resolve_topic_name(name)
             events = SubscriptionEventCallbacks(
                 incompatible_qos=functools.partial(self._on_incompatible_qos, topic, True),
@@ -302,7 +325,7 @@ class ScanNode(LifecycleNode):
         for publisher in self._outputs.values():
             self.destroy_lifecycle_publisher(publisher)
         self._inputs, self._services_of_scan, self._outputs = [], [], {}
-        self._worker = self._scanner = self._jump = None
+        self._worker = self._scanner = self._estimator = self._jump = None
         self._jobs = set()
         self._estimate_asked = self._failing = False
         self._incompatible.clear()
@@ -387,6 +410,8 @@ class ScanNode(LifecycleNode):
 
     def _estimate(self, scanner: Scanner, estimate: Callable[[], list[Result]]) -> list[Result]:
         """One round of estimates, published."""
+        if self._estimator is not None:
+            self._estimator.rest_on(self._settings.evidence_settings)
         failed_before = scanner.statistics().failed
         results = estimate()
         self._failing = scanner.statistics().failed > failed_before
@@ -447,7 +472,8 @@ class ScanNode(LifecycleNode):
 
     def _scanner_if_active(self, response: Any) -> Scanner | None:
         if not self._active:
-            response.success, response.message = False, "The node is not active: activate it first."
+            how = lifecycle(self.get_fully_qualified_name(), "activate")
+            response.success, response.message = False, f"The node is not active: {how} makes it so."
             return None
         return self._scanner
 
@@ -462,42 +488,68 @@ class ScanNode(LifecycleNode):
 
     # Parameters.
 
+    def _tell_unknown_parameters(self) -> list[str]:
+        subscribed = {self.resolve_topic_name(each[1]) for each in (*INPUTS, CAMERA_INFO)}
+        published = {self.resolve_topic_name(each[0]) for each in OUTPUTS} | {DIAGNOSTICS_TOPIC}
+        overridable = [
+            f"qos_overrides.{topic}.{end}.{policy.name.lower()}"
+            for topics, end in ((subscribed, "subscription"), (published, "publisher"))
+            for topic in sorted(topics)
+            for policy in OVERRIDABLE.policy_kinds
+        ]
+        # rclpy has no other way to ask for what was given without declaring it.
+        unknown = unknown_parameters(self._parameter_overrides, overridable)
+        for sentence in unknown:
+            self.get_logger().warning(sentence)
+        return unknown
+
     def _judge_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        configured = self.get_fully_qualified_name() if self._scanner is not None else ""
         try:
-            changed_settings(self._settings, parameters, configured=self._scanner is not None)
+            changed_settings(self._settings, parameters, configured=configured)
         except SettingsError as err:
             return SetParametersResult(successful=False, reason=str(err))
         return SetParametersResult(successful=True)
 
     def _take_parameters(self, parameters: Sequence[Parameter]) -> None:
         old = self._settings
-        self._settings = changed_settings(old, parameters, configured=False)
+        self._settings = changed_settings(old, parameters)
         if self._scanner is not None and self._settings != old:
             self._scanner.change_settings(self._settings)
-            if self._active:  # fewer views may be left, of which there is no estimate yet
+            if self._active:  # fewer views may be left, or other evidence counts
                 self._ask_for_estimate()
-        if (old.diagnostics, old.diagnostics_period_s) != (
-            self._settings.diagnostics,
-            self._settings.diagnostics_period_s,
-        ):
-            self._set_diagnostics_timer()
+        if old.diagnostics_period_s != self._settings.diagnostics_period_s:
+            self._set_health_timer()
 
     # Diagnostics.
 
-    def _set_diagnostics_timer(self) -> None:
-        if self._diagnostics_timer is not None:
-            self.destroy_timer(self._diagnostics_timer)
-            self._diagnostics_timer = None
-        if self._settings.diagnostics:
-            # Steady, so that they go on while simulated time stands still.
-            self._diagnostics_timer = self.create_timer(
-                self._settings.diagnostics_period_s,
-                self._publish_diagnostics,
-                clock=Clock(clock_type=ClockType.STEADY_TIME),
-            )
+    def _set_health_timer(self) -> None:
+        if self._health_timer is not None:
+            self.destroy_timer(self._health_timer)
+        # Steady, so that it goes on while simulated time stands still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._health_timer = self.create_timer(
+            self._settings.diagnostics_period_s, self._look_after_itself, clock=steady
+        )
 
-    def _publish_diagnostics(self) -> None:
+    def _look_after_itself(self) -> None:
         scanner = self._scanner
+        statistics = scanner.statistics() if scanner is not None else None
+        self._tell_unpaired(statistics)
+        if self._settings.diagnostics:
+            self._publish_diagnostics(statistics)
+
+    def _tell_unpaired(self, statistics: Statistics | None) -> None:
+        """Images without camera infos: nothing is wrong with any message, and yet nothing happens."""
+        before, self._unpaired = self._unpaired, ""
+        if statistics is None or (statistics.unpaired_s or 0.0) < UNPAIRED_AFTER_S:
+            return
+        topic = self.resolve_topic_name(CAMERA_INFO[1])
+        self._unpaired = pairing_advice(topic, self._publishers_of.get(topic, 0))
+        if self._unpaired != before:
+            self.get_logger().warning(self._unpaired)
+
+    def _publish_diagnostics(self, statistics: Statistics | None) -> None:
         health = NodeHealth(
             state=self._state_machine.current_state[1],
             failure=self._failure,
@@ -506,8 +558,9 @@ class ScanNode(LifecycleNode):
             lost=dict(self._lost),
             longest_callbacks_s=dict(self._longest_callback_s),
             incompatible=self._incompatible_now(),
+            unpaired=self._unpaired,
+            ignored=self._ignored,
         )
-        statistics = scanner.statistics() if scanner is not None else None
         status = diagnostic_status(self.get_fully_qualified_name(), health, statistics)
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()

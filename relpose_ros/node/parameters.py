@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 
-from relpose_ros.scanning.settings import ScanSettings, SettingsError
+from relpose_ros.scanning.settings import ScanSettings, SettingsError, did_you_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from dataclasses import Field
 
     from rclpy.node import Node
@@ -23,6 +23,10 @@ ONLY_UNCONFIGURED = frozenset(each.name for each in fields(ScanSettings) if each
     "threads",
 }
 """Read when the node is configured: setting one of them later would silently do nothing."""
+BACK, FORTH = ("deactivate", "cleanup"), ("configure", "activate")
+"""Transitions from an active node to one that can be configured, and from there to an active one."""
+OF_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides./clock.")
+"""How the names begin that rclpy declares in every node."""
 
 
 def declare_parameters(node: Node) -> ScanSettings:
@@ -39,15 +43,32 @@ def declare_parameters(node: Node) -> ScanSettings:
     return ScanSettings.from_mapping({name: node.get_parameter(name).value for name in NAMES})
 
 
+def unknown_parameters(given: Iterable[str], overridable: Iterable[str]) -> list[str]:
+    """A sentence about each name that was given a value and that the node does not have.
+
+    ROS passes over such a name without a word.
+
+    Args:
+        given: Names given on the command line or in a file.
+        overridable: The ``qos_overrides`` of the node's topics.
+    """
+    known = (*NAMES, *overridable)
+    return [
+        f"There is no parameter {name}{did_you_mean(name, known)}: the value given for it does nothing."
+        for name in given
+        if name not in known and not name.startswith(OF_RCLPY)
+    ]
+
+
 def changed_settings(
-    settings: ScanSettings, parameters: Sequence[Parameter], *, configured: bool
+    settings: ScanSettings, parameters: Sequence[Parameter], *, configured: str = ""
 ) -> ScanSettings:
     """The settings with some parameters set anew. Parameters that are none of ours are passed over.
 
     Args:
         settings: The settings in force.
         parameters: What somebody wants to set.
-        configured: Whether the node is past its configuration.
+        configured: The node's name, where it is past its configuration.
 
     Raises:
         SettingsError: A value is refused, or comes too late.
@@ -57,10 +78,15 @@ def changed_settings(
         if value is None:
             raise SettingsError(f"{name} cannot be unset: give it a value.")
         if configured and name in ONLY_UNCONFIGURED:
-            text = "is read when the node is configured: clean the node up, set it, and configure again."
-            raise SettingsError(f"{name} {text}")
+            text = f"{name} is read when the node is configured. First {lifecycle(configured, *BACK)}; then"
+            raise SettingsError(f"{text} set it, and {lifecycle(configured, *FORTH)}.")
     current = {name: getattr(settings, name) for name in NAMES}
     return ScanSettings.from_mapping(current | wanted)
+
+
+def lifecycle(node_name: str, *transitions: str) -> str:
+    """The commands that take a node through some transitions."""
+    return ", ".join(f"`ros2 lifecycle set {node_name} {each}`" for each in transitions)
 
 
 def _as_parameter(value: Any) -> Any:

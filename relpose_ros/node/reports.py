@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.qos import QoSPolicyKind
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from relpose_ros.scanning.scanner import Statistics
 
@@ -102,6 +102,18 @@ def loss_advice(topic: str, lost: int) -> str:
     )
 
 
+def pairing_advice(topic: str, publishers: int) -> str:
+    """What to do about images of which no view comes, because no camera info has their stamp.
+
+    Args:
+        topic: Of the camera infos, as it is on the graph, remapped.
+        publishers: How many nodes publish it.
+    """
+    if publishers == 0:
+        return f"Images come in, but nobody publishes {topic}: remap camera_info, or send ObjectView."
+    return f"Images come in, but no message on {topic} has the stamp of one: give both the same header.stamp."
+
+
 @dataclass(frozen=True)
 class NodeHealth:
     """What the node knows of itself, beside its scanner's statistics."""
@@ -120,6 +132,10 @@ class NodeHealth:
     """The slowest callback so far, by topic."""
     incompatible: Mapping[str, str] = field(default_factory=dict)
     """What to do about QoS that does not fit, by topic."""
+    unpaired: str = ""
+    """What to do about images without camera infos; empty where there is nothing to do."""
+    ignored: Sequence[str] = ()
+    """A sentence about each parameter that was given and does not exist."""
 
 
 def diagnostic_status(name: str, health: NodeHealth, statistics: Statistics | None) -> DiagnosticStatus:
@@ -128,13 +144,17 @@ def diagnostic_status(name: str, health: NodeHealth, statistics: Statistics | No
     if statistics is not None:
         views = sum(scan.views for scan in statistics.scans.values())
         message = f"{health.state}, objects: {len(statistics.scans)}, views: {views}"
-        if health.failing:
-            level, message = DiagnosticStatus.WARN, statistics.last_failure
-    if health.incompatible:
-        level, message = DiagnosticStatus.WARN, next(iter(health.incompatible.values()))
+    failure = statistics.last_failure if statistics is not None and health.failing else ""
+    warnings = [*health.incompatible.values(), failure, health.unpaired, *health.ignored]
+    worst = next(filter(None, warnings), "")
+    if worst:
+        level, message = DiagnosticStatus.WARN, worst
     if health.failure:
         level, message = DiagnosticStatus.ERROR, health.failure
     values = [("state", health.state)]
+    values += (("parameter", sentence) for sentence in health.ignored)
+    if health.unpaired:
+        values.append(("camera info", health.unpaired))
     values += ((f"{topic} QoS", advice) for topic, advice in health.incompatible.items())
     values += ((f"{topic} publishers", str(count)) for topic, count in health.publishers.items())
     values += ((f"{topic} lost", str(count)) for topic, count in health.lost.items())

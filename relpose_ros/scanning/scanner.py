@@ -110,6 +110,8 @@ class Statistics:
     """By object id."""
     waiting: int
     """Images that wait for a camera info of their stamp."""
+    unpaired_s: float | None
+    """Seconds since the first image that found none, if no other image has found one since; else None."""
     failed: int
     """Estimates that ended in an error."""
     last_failure: str
@@ -146,6 +148,7 @@ class Scanner:
         self._scans: dict[str, _ScanState] = {}
         self._topics: dict[str, _TopicState] = {}
         self._taken_back: list[Result] = []
+        self._unpaired_since: float | None = None
         self._failed = 0
         self._last_failure = ""
 
@@ -218,6 +221,7 @@ class Scanner:
         """
         with self._receiving, self._state:
             self._pairing.clear()
+            self._unpaired_since = None
             chosen = [each for each in self._scans if object_id in {None, each}]
             forgotten = 0
             for each in chosen:
@@ -249,13 +253,19 @@ class Scanner:
         return Receipt(False, object_id or "", f"There is no view{of} to drop.")
 
     def change_settings(self, settings: ScanSettings) -> None:
-        """Go on with other settings, from the next message on. Views that are too many now leave at once."""
+        """Go on with other settings, from the next message on. Views that are too many now leave at once.
+
+        Where other evidence counts, of which the caller tells the estimator, every scan is estimated again.
+        """
         with self._receiving, self._state:
+            evidence_changed = settings.evidence_settings != self._settings.evidence_settings
             self._settings = settings
             self._pairing.limit = settings.pairing_queue
             self._pairing.backward_jump_ns = round(settings.backward_jump_s * 1e9)
             for state in self._scans.values():
                 state.buffer.change_settings(settings)
+                if evidence_changed:
+                    state.buffer.require_work()
             while len(self._scans) > settings.max_scans:
                 self._forget_oldest_scan()
 
@@ -263,6 +273,7 @@ class Scanner:
         """A snapshot for diagnostics."""
         with self._receiving:
             waiting = self._pairing.waiting()
+            since = self._unpaired_since
         with self._state:
             return Statistics(
                 topics={
@@ -271,6 +282,7 @@ class Scanner:
                 },
                 scans={object_id: state.snapshot() for object_id, state in self._scans.items()},
                 waiting=waiting,
+                unpaired_s=None if since is None else self._clock() - since,
                 failed=self._failed,
                 last_failure=self._last_failure,
             )
@@ -286,7 +298,10 @@ class Scanner:
             self._offer_pair(pair) for pair in self._pairing.add(kind, Arrival(message, source), camera)
         ]
         if not receipts:
+            if kind != "camera_info" and self._unpaired_since is None:
+                self._unpaired_since = self._clock()
             return Receipt(False, "", "")
+        self._unpaired_since = None
         # Of a picture that came both raw and compressed, one is enough.
         return max(receipts, key=lambda receipt: (receipt.accepted, receipt.rejected))
 

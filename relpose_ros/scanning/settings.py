@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -17,7 +18,7 @@ from relpose_ros.inference.evidence import EvidenceSettings
 from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
 MAX_NAME_LENGTH = 128
 """Longest object id or frame name, characters: a longer one is garbage, and would go out in every message."""
@@ -191,8 +192,8 @@ class ScanSettings:
         defaults = {each.name: each.default for each in fields(cls)}
         unknown = [str(name) for name in values if name not in defaults]
         if unknown:
-            text = f"There is no setting {', '.join(unknown)}: the settings are {', '.join(defaults)}."
-            raise SettingsError(text)
+            named = ", ".join(f"{name}{did_you_mean(name, defaults)}" for name in unknown)
+            raise SettingsError(f"There is no setting {named}: the settings are {', '.join(defaults)}.")
         given = {name: _like_default(value, defaults[name]) for name, value in values.items()}
         return cls(**given)
 
@@ -229,6 +230,12 @@ class ScanSettings:
         foreign = {"use_sim_time", "qos_overrides"}
         own = {name: each for name, each in values.items() if str(name).partition(".")[0] not in foreign}
         return cls.from_mapping(own)
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The known name that is nearest to a misspelt one, in brackets; empty where none is near."""
+    nearest = get_close_matches(name, known, n=1)
+    return f" (did you mean {nearest[0]}?)" if nearest else ""
 
 
 def _like_default(value: Any, default: Any) -> Any:

@@ -61,6 +61,9 @@ loading_s, estimating_s = (float(each) for each in sys.argv[1:3])
 del sys.argv[1:3]
 
 class Estimator:
+    def rest_on(self, evidence):
+        print("resting on", evidence.use, flush=True)
+
     def estimate(self, scan):
         print("estimating", flush=True)
         time.sleep(estimating_s)
@@ -398,9 +401,10 @@ def start_without_network(start: Callable[..., NodeProcess]) -> Callable[..., No
     """Starts nodes whose estimator only takes its time, and quickly, because they do without PyTorch."""
 
     def start_without_network(
-        *parameters: str, loading_s: float = 0.0, estimating_s: float = 0.0
+        *parameters: str, loading_s: float = 0.0, estimating_s: float = 0.0, files: Sequence[Path] = ()
     ) -> NodeProcess:
         given = [word for each in (NONE_LOST, *parameters) for word in ("-p", each)]
+        given += [word for each in files for word in ("--params-file", str(each))]
         times = (str(loading_s), str(estimating_s))
         return start(*times, "--ros-args", *given, program=START_WITHOUT_NETWORK)
 

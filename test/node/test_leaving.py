@@ -16,6 +16,7 @@ from sensor_msgs.msg import Image
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
 BOTH = pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 FOR_EVER_S = 1000.0
@@ -95,6 +96,28 @@ def test_without_autostart_it_waits_for_a_manager(
     assert new_graph.node.count_subscribers("/image") == 0
     assert new_graph.change_state(Transition.TRANSITION_INACTIVE_SHUTDOWN)
     assert new_graph.state() == "finalized"
+    assert node.end() == 0
+
+
+def test_a_misspelt_parameter_is_told(
+    start_without_network: Callable[..., Any], new_graph: Any, tmp_path: Path
+) -> None:
+    file = tmp_path / "params.yaml"
+    file.write_text(
+        "/**:\n  ros__parameters:\n    max_view: 3\n    use_sim_time: false\n"
+        "    qos_overrides: {/image: {subscription: {depht: 7}}}\n"
+        "other_node:\n  ros__parameters: {exposure: 1}\n"
+    )
+    node = start_without_network("evidense:=network", "image_transports:=[raw]", files=[file])
+    node.wait_for("Waiting for views")
+    for given, meant in (
+        ("evidense", "evidence"),
+        ("max_view", "max_views"),
+        ("qos_overrides./image.subscription.depht", "qos_overrides./image.subscription.depth"),
+    ):
+        assert node.told("WARN", f"no parameter {given} (did you mean {meant}?)"), list(node.lines)
+    assert len(node.told("no parameter")) == 3, list(node.lines)
+    assert "no parameter" in new_graph.diagnostics().message
     assert node.end() == 0
 
 

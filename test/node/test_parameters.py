@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
@@ -7,7 +8,12 @@ import pytest
 import rclpy
 from rclpy.parameter import Parameter
 
-from relpose_ros.node.parameters import ONLY_UNCONFIGURED, changed_settings, declare_parameters
+from relpose_ros.node.parameters import (
+    ONLY_UNCONFIGURED,
+    changed_settings,
+    declare_parameters,
+    unknown_parameters,
+)
 from relpose_ros.scanning.settings import ScanSettings, SettingsError
 
 if TYPE_CHECKING:
@@ -68,12 +74,12 @@ def test_given_values_that_are_refused(make_node: Callable[..., Any], name: str,
 
 def test_parameters_of_others_are_passed_over() -> None:
     others = [Parameter("use_sim_time", value=True), Parameter("qos_overrides./image.depth", value=3)]
-    assert changed_settings(ScanSettings(), others, configured=True) == ScanSettings()
+    assert changed_settings(ScanSettings(), others, configured="/scan_node") == ScanSettings()
 
 
 def test_several_parameters_change_together() -> None:
     wanted = [Parameter("max_views", value=5), Parameter("keep", value="latest")]
-    changed = changed_settings(ScanSettings(max_scans=2), wanted, configured=True)
+    changed = changed_settings(ScanSettings(max_scans=2), wanted, configured="/scan_node")
     assert changed == ScanSettings(max_scans=2, max_views=5, keep="latest")
 
 
@@ -81,11 +87,42 @@ def test_several_parameters_change_together() -> None:
 def test_what_is_read_once_changes_only_before(name: str) -> None:
     default = SETTINGS[name].default
     wanted = [Parameter(name, value=list(default) if isinstance(default, tuple) else default)]
-    assert changed_settings(ScanSettings(), wanted, configured=False) == ScanSettings()
-    with pytest.raises(SettingsError, match=f"{name} .*configure"):
-        changed_settings(ScanSettings(), wanted, configured=True)
+    assert changed_settings(ScanSettings(), wanted) == ScanSettings()
+    with pytest.raises(SettingsError) as refused:
+        changed_settings(ScanSettings(), wanted, configured="/lab/scan_node")
+    commands = re.findall(r"`ros2 lifecycle set /lab/scan_node (\w+)`", str(refused.value))
+    assert commands == ["deactivate", "cleanup", "configure", "activate"]
+    assert str(refused.value).startswith(f"{name} ")
+
+
+QOS = "qos_overrides./image.subscription.reliability"
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("evidense", "evidence"),
+        ("max_view", "max_views"),
+        ("qos_overrides./imag.subscription.reliability", QOS),
+        ("qos_overrides./image.subscription.reliabilty", QOS),
+    ],
+)
+def test_a_misspelt_parameter_is_told_with_the_nearest_name(given: str, meant: str) -> None:
+    (sentence,) = unknown_parameters(["keep", given, QOS], [QOS])
+    assert f"no parameter {given} (did you mean {meant}?)" in sentence
+
+
+def test_a_parameter_like_no_other_is_told_too() -> None:
+    assert unknown_parameters(["zzz"], [QOS]) == [
+        "There is no parameter zzz: the value given for it does nothing."
+    ]
+
+
+def test_the_parameters_of_rclpy_are_no_mistake() -> None:
+    given = ["use_sim_time", "start_type_description_service", "qos_overrides./clock.subscription.depth"]
+    assert unknown_parameters(given, [QOS]) == []
 
 
 def test_a_parameter_cannot_be_unset() -> None:
     with pytest.raises(SettingsError, match="max_views"):
-        changed_settings(ScanSettings(), [Parameter("max_views")], configured=False)
+        changed_settings(ScanSettings(), [Parameter("max_views")])

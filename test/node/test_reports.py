@@ -94,6 +94,7 @@ def test_diagnostics_tell_the_worst_first() -> None:
         topics={"/image": TopicStatistics(received=9, used=4, rejected=2, last_reason="the width is 0")},
         scans={"mug": ScanStatistics(4, 3, 1, 0.25, "enough", (1, 2), 0.875)},
         waiting=3,
+        unpaired_s=None,
         failed=0,
         last_failure="",
     )
@@ -118,6 +119,11 @@ def test_diagnostics_tell_the_worst_first() -> None:
     deaf = replace(healthy, incompatible={"/image": "set the QoS"})
     told = diagnostic_status("/scan_node", deaf, statistics)
     assert (told.level, told.message) == (DiagnosticStatus.WARN, "set the QoS")
+    unpaired = diagnostic_status("/scan_node", replace(healthy, unpaired="no camera info"), statistics)
+    assert (unpaired.level, unpaired.message) == (DiagnosticStatus.WARN, "no camera info")
+    misspelt = diagnostic_status("/scan_node", replace(healthy, ignored=["no such name"]), statistics)
+    assert (misspelt.level, misspelt.message) == (DiagnosticStatus.WARN, "no such name")
+    assert ("parameter", "no such name") in [(each.key, each.value) for each in misspelt.values]
     lost = replace(deaf, state="unconfigured", failure="no such weights")
     told = diagnostic_status("/scan_node", lost, None)
     assert (told.level, told.message) == (DiagnosticStatus.ERROR, "no such weights")

@@ -222,6 +222,32 @@ def test_views_that_other_parameters_leave_are_estimated_at_once(node: Any, grap
         assert graph.set_parameter("max_views", 8) == (True, "")
 
 
+def test_other_evidence_counts_at_once(node: Any, graph: Any, make: Any) -> None:
+    graph.publish(OBJECT_VIEW, *(make.object_view(10.0 + k, "mug") for k in range(2)))
+    assert not graph.estimate_of("mug", views=2).scale_known
+    graph.estimates.clear()
+    assert graph.set_parameter("first_view_distance", 0.5) == (True, "")
+    try:
+        assert graph.estimate_of("mug", views=2).scale_known
+    finally:
+        assert graph.set_parameter("first_view_distance", 0.0) == (True, "")
+
+
+def test_images_without_camera_infos_are_told(node: Any, graph: Any, make: Any) -> None:
+    def publish(stamp: float) -> None:
+        graph.publish(IMAGE, make.image(stamp))
+
+    graph.publish_until(lambda: node.told("WARN", "Images come in", "/camera_info"), "a warning", publish)
+    assert "Images come in" in graph.diagnostics().message
+    assert len(node.told("WARN", "Images come in")) == 1
+
+    def publish_both(stamp: float) -> None:
+        graph.publish(IMAGE, make.image(100 + stamp))
+        graph.publish(CAMERA_INFO, make.camera_info(100 + stamp))
+
+    graph.publish_until(lambda: graph.diagnostic("camera info") is None, "its end", publish_both)
+
+
 def test_parameters_are_described_and_judged(node: Any, graph: Any) -> None:
     limits = graph.descriptor("max_views").integer_range[0]
     assert (limits.from_value, limits.to_value) == (2, 8)
@@ -233,7 +259,7 @@ def test_parameters_are_described_and_judged(node: Any, graph: Any) -> None:
         ("object_frame", "", "object_frame"),
         ("object_frame", None, ""),
         ("backward_jump_s", float("nan"), "backward_jump_s"),
-        ("weights", "/elsewhere", "clean the node up"),
+        ("weights", "/elsewhere", "`ros2 lifecycle set /scan_node cleanup`"),
     ):
         accepted, reason = graph.set_parameter(name, value)
         assert not accepted, (name, value)
@@ -263,7 +289,9 @@ def test_transitions(node: Any, graph: Any, make: Any, tmp_path: Path) -> None:
     graph.estimate_of("mug", views=2)
 
     assert graph.change_state(Transition.TRANSITION_DEACTIVATE)
-    assert not graph.trigger("estimate_now").success
+    refusal = graph.trigger("estimate_now")
+    assert not refusal.success
+    assert "`ros2 lifecycle set /scan_node activate`" in refusal.message
     graph.publish(OBJECT_VIEW, make.object_view(12.0, "mug"))
     assert not graph.change_state(Transition.TRANSITION_CONFIGURE), "it is configured"
     assert graph.state() == "inactive"
@@ -285,7 +313,7 @@ def test_transitions(node: Any, graph: Any, make: Any, tmp_path: Path) -> None:
         assert graph.set_parameter("weights", nowhere) == (True, "")
         assert not graph.change_state(Transition.TRANSITION_CONFIGURE)
         assert graph.state() == "unconfigured"
-        assert node.told("ERROR", nowhere)
+        assert node.told("ERROR", nowhere, "`ros2 lifecycle set /scan_node configure`")
         assert nowhere in graph.diagnostics().message
 
         assert graph.set_parameter("weights", weights) == (True, "")

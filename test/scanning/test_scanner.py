@@ -208,6 +208,48 @@ def test_statistics_tell_the_state_of_each_scan(messages: Any, circle_estimator:
     assert scanner.statistics().waiting == 1
 
 
+def test_images_that_find_no_camera_info_are_noticed(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    now = [0.0]
+    scanner = Scanner(circle_estimator(), ScanSettings(), clock=lambda: now[0])
+
+    def receive(kind: Any, stamp: int) -> None:
+        size = (40, 32, (4, 4, 20, 20))
+        message = (
+            bag_messages.rgb(pixels(), stamp=stamp)
+            if kind == "image"
+            else bag_messages.camera_info(*size, stamp=stamp)
+        )
+        scanner.receive(kind, kind, message)
+
+    receive("camera_info", 1)
+    assert scanner.statistics().unpaired_s is None, "a camera info alone is no image"
+    now[0] = 10.0
+    receive("image", 2)
+    now[0] = 13.0
+    receive("image", 3)
+    assert scanner.statistics().unpaired_s == 3.0
+    receive("camera_info", 3)
+    assert scanner.statistics().unpaired_s is None, "one lost camera info is no matter"
+    receive("image", 4)
+    scanner.reset("for a test")
+    assert scanner.statistics().unpaired_s is None
+
+
+def test_other_evidence_has_every_scan_estimated_again(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    scanner = Scanner(circle_estimator(), ScanSettings())
+    send_views(scanner, bag_messages, 1, 2)
+    send_views(scanner, bag_messages, 3, 4, object_id="can")
+    drain(scanner)
+    scanner.change_settings(ScanSettings(pairing_queue=3))
+    assert not scanner.pending(), "the views are as they were"
+    scanner.change_settings(ScanSettings(pairing_queue=3, evidence="network"))
+    assert sorted(result.scan.object_id for result in drain(scanner)) == ["can", "mug"]
+
+
 def test_reset_forgets_one_object_or_all(
     bag_messages: Any, circle_estimator: Callable[..., Any], caplog: pytest.LogCaptureFixture
 ) -> None:

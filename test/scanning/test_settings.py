@@ -58,8 +58,10 @@ def test_what_no_scanner_could_work_with_is_refused(name: str, value: object, sa
 def test_a_mapping_may_spell_values_as_parameters_do() -> None:
     settings = ScanSettings.from_mapping({"backward_jump_s": 2, "image_transports": ["raw"]})
     assert settings == ScanSettings(backward_jump_s=2.0, image_transports=("raw",))
-    with pytest.raises(SettingsError, match="no setting max_view: the settings are object_frame"):
+    with pytest.raises(SettingsError, match=r"no setting max_view \(did you mean max_views\?\): the"):
         ScanSettings.from_mapping({"max_view": 3})
+    with pytest.raises(SettingsError, match="no setting zzz: the settings are object_frame"):
+        ScanSettings.from_mapping({"zzz": 3})
 
 
 def test_a_parameter_file_may_hold_several_nodes(tmp_path: Path) -> None:
