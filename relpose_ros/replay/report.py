@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from relpose_ros.estimates import Verdict
+from relpose_ros.estimates import Evidence, Verdict
 from relpose_ros.geometry import so3
 from relpose_ros.replay.comparison import compare
 from relpose_ros.scanning.outgoing import is_weak, view_colour
@@ -130,7 +130,7 @@ def _facts(recording: Recording, last: EstimateRecord, comparison: Comparison | 
     count = len(recording.estimates)
     estimates = "estimate" if count == 1 else "estimates"
     facts = [
-        f"{len(recording.views)} views came in; the last of {count} {estimates} rests on {len(last.views)}."
+        f"{len(recording.views)} views were used; the last of {count} {estimates} rests on {len(last.views)}."
     ]
     if comparison is not None:
         errors = np.array(list(comparison.rotation_errors.values()))
@@ -193,6 +193,7 @@ def _pair(pair: PairRotation, comparison: Comparison | None) -> dict[str, Any]:
         "off": _rounded(np.degrees(pair.solution_angle)),
         "ambiguous": _rounded(np.degrees(pair.ambiguity_angle)) if pair.ambiguous else None,
         "weak": bool(is_weak(pair)),
+        "matched": bool(pair.evidence & Evidence.GEOMETRIC),
         "entropy": _rounded(pair.entropy),
         "error": None if error is None else _rounded(error),
     }

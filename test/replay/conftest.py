@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from relpose_ros.captures.folder import Frame, save_capture
-from relpose_ros.estimates import CameraPose, Mode, PairRotation, ScanEstimate, Verdict
+from relpose_ros.estimates import CameraPose, Evidence, Mode, PairRotation, ScanEstimate, Verdict
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import look_at, translation_of
 from relpose_ros.replay.comparison import TruePose
@@ -97,6 +97,7 @@ class FakeEstimator:
         return PairRotation(
             i, j, rotation, covariance, -3.0, modes[0].weight, tuple(modes), ambiguous,
             np.pi if ambiguous else 0.0, modes[0].weight, 0.01,
+            Evidence.LEARNED if ambiguous else Evidence.LEARNED | Evidence.GEOMETRIC,
         )  # fmt: skip
 
 

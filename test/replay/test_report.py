@@ -67,7 +67,7 @@ def test_the_page_needs_nothing_but_itself(page: str) -> None:
 
 def test_the_page_says_in_words_what_came_out(page: str) -> None:
     assert "Enough to act on" in page
-    assert "5 views came in; the last of 4 estimates rests on 5." in page
+    assert "5 views were used; the last of 4 estimates rests on 5." in page
     # Cameras 1 to 4 are turned by the same 20 degrees about their own axes, the first is not.
     assert "of 10 relative rotations are right to 15°" in page
     assert "&lt;b&gt;mug &amp; cup in bag" in page
@@ -88,6 +88,7 @@ def test_what_is_drawn_is_what_was_estimated(page: str) -> None:
         assert pose["p"] == pytest.approx(last["cameras"][int(view)]["p"], abs=1e-4)
     ambiguous = [pair for pair in last["pairs"] if pair["ambiguous"] is not None]
     assert [(pair["i"], pair["j"], pair["ambiguous"]) for pair in ambiguous] == [(0, 1, 180)]
+    assert [(pair["i"], pair["j"]) for pair in last["pairs"] if not pair["matched"]] == [(0, 1)]
     points = np.array(data["distributions"][0]["points"])
     assert points[:, 3].sum() == pytest.approx(0.95, abs=0.01)
 

@@ -100,12 +100,14 @@ def test_the_page_can_be_turned_played_and_sorted(
     assert found["playing"] == "Play"
     assert found["slid"] == names[1]
     assert found["drawings"] == [True, False], "without the ground truth it is another one"
-    pairs, sure, _, ambiguous, *_ = found["columns"]
+    pairs, sure, _, ambiguous, rests_on, *_ = found["columns"]
     assert pairs[0][:3] == ["ascending", "0 1", "0 2"]
     assert pairs[1] == ["descending", *pairs[0][:0:-1]]
     assert sorted(sure[0]) == sorted([*sure[1][1:], "ascending"])
     assert ambiguous[0][:2] == ["descending", "by 180°"], "what is wrong comes first"
     assert (ambiguous[1][0], ambiguous[1][-1]) == ("ascending", "by 180°")
+    assert rests_on[0][1] == "the network and matches"
+    assert rests_on[1][:2] == ["ascending", "the network alone"]
     name, marked, step = found["chosen"]
     assert re.fullmatch(r"\d-\d", name)
     assert (marked, step) == (2, 3), "a card and a row, of the last estimate"
