@@ -75,8 +75,8 @@ class ScanBuffer:
         self._newest_on: dict[str, int] = {}
         self._suspects: dict[str, list[View]] = {}
         """Views of one stamp on each topic, from cameras that are triggered together."""
-        self._seen: deque[tuple[int, str]] = deque(maxlen=_SEEN)
-        """Stamp and frame, which are what tells pictures apart whatever topic they come on."""
+        self._seen: deque[tuple[int, str, str]] = deque(maxlen=_SEEN)
+        """Stamp and frame, which are what tells pictures apart whatever their topic, and that topic."""
         self._changed = False
         self._failed = False
         self._base: ScanEstimate | None = None
@@ -97,6 +97,10 @@ class ScanBuffer:
         jumps = self._jumps_back(stamp_ns, topic) or self._confirms_jump(stamp_ns, frame_id, topic)
         if jumps or newest_ns is None:
             return None
+        if (stamp_ns, frame_id, topic) in self._seen:
+            text = f"a view with this stamp and frame_id {frame_id!r} came on this topic before"
+            advice = "give each picture its own stamp, and each camera its own frame_id"
+            return Decision(False, f"{text}: {advice}", rejected=True)
         if self._was_seen(stamp_ns, frame_id):
             return Decision(False, "a view with this stamp and frame was seen already")
         if stamp_ns < newest_ns:
@@ -249,7 +253,7 @@ class ScanBuffer:
 
     def _note_time(self, stamp_ns: int, frame_id: str, topic: str) -> None:
         """Time goes on in this topic: whatever lay far behind was garbage."""
-        self._seen.append((stamp_ns, frame_id))
+        self._seen.append((stamp_ns, frame_id, topic))
         self._newest_on[topic] = stamp_ns
         self._suspects.pop(topic, None)
 
@@ -279,7 +283,8 @@ class ScanBuffer:
 
     def _was_seen(self, stamp_ns: int, frame_id: str) -> bool:
         picture = stamp_ns, frame_id
-        return picture in self._seen or any((view.stamp_ns, view.frame_id) == picture for view in self._all())
+        seen = any(each[:2] == picture for each in self._seen)
+        return seen or any((view.stamp_ns, view.frame_id) == picture for view in self._all())
 
     def _follow_jump(self, first: View) -> None:
         """Forget what lies after the first view of the time that counts from now on."""

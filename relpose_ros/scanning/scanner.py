@@ -56,7 +56,7 @@ class Receipt:
     """A sentence for the log: why not, or what else happened; empty where there is nothing to say."""
     rejected: bool = False
     """Whether the message was bad. A message can be neither accepted nor rejected: it waits for its
-    counterpart, was delivered twice, or the scan has views enough."""
+    counterpart, came on another topic too, or the scan has views enough."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,7 +89,7 @@ def test_spread_undoes_a_swap_that_gains_nothing(circle_estimator: Callable[...,
     assert estimate_all(buffer, estimator) == [False]
     assert stamps_of(buffer) == [1, 2, 3]
     assert not buffer.has_work()
-    (again,) = add(buffer, 4)
+    again = buffer.add(view(4), "copies")
     assert not again.accepted
     assert not again.rejected, "the same picture by another transport"
     assert buffer.dropped == 1
@@ -174,10 +174,11 @@ def test_spread_takes_newcomers_in_turn_and_lets_the_oldest_go(circle_estimator:
 
 
 @pytest.mark.parametrize("keep", ["first", "latest", "spread"])
-def test_a_late_view_is_rejected_and_a_repeated_one_declined(keep: str) -> None:
+def test_a_late_view_is_rejected_and_so_is_a_repeated_stamp(keep: str) -> None:
     buffer = buffer_with(1.0, 1.5, keep=keep)
     repeated, late, good = add(buffer, 1.0, 1.2, 1.6)
-    assert repeated == Decision(False, "a view with this stamp and frame was seen already")
+    assert repeated.rejected
+    assert "give each picture its own stamp, and each camera its own frame_id" in repeated.reason
     assert late.rejected
     assert (
         late.reason == "it is 0.300 s older than the scan of 'mug', whose newest view has stamp 1.500000000"

@@ -115,11 +115,21 @@ def test_two_cameras_that_are_triggered_together_are_two_views(
     for stamp, frame in both:
         assert send_views(scanner, messages, stamp, frame_id=frame) == [Receipt(True, "mug", "")]
     (again,) = send_views(scanner, messages, 2, frame_id="left")
-    assert again == Receipt(
-        False, "mug", "views, stamp 2.000000000: a view with this stamp and frame was seen already."
+    assert again.rejected
+    assert again.reason.startswith(
+        "views, stamp 2.000000000: a view with this stamp and frame_id 'left' came on"
     )
     (result,) = drain(scanner)
     assert [(view.stamp_ns / SECOND, view.frame_id) for view in result.scan.views] == both
+
+
+def test_a_driver_that_sets_no_stamp_is_told(messages: Any, circle_estimator: Callable[..., Any]) -> None:
+    scanner = Scanner(circle_estimator(), ScanSettings())
+    first, second = send_views(scanner, messages, 0, 0)
+    assert first.accepted
+    assert second.rejected
+    assert "stamp 0.000000000" in second.reason
+    assert "its own stamp" in second.reason
 
 
 def test_a_wrong_pair_is_rejected_under_the_name_of_the_image(
@@ -178,9 +188,9 @@ def test_a_rejected_message_is_counted_with_its_reason(
     assert late.rejected
     assert late.reason.startswith("views, stamp 1.500000000: it is 0.500 s older than the scan of 'mug'")
     (repeated,) = send_views(scanner, messages, 2)
-    assert not repeated.rejected
+    assert repeated.rejected
     counts = scanner.statistics().topics["views"]
-    assert counts == TopicStatistics(received=5, used=2, rejected=2, last_reason=late.reason)
+    assert counts == TopicStatistics(received=5, used=2, rejected=3, last_reason=repeated.reason)
 
 
 def test_a_view_the_scan_cannot_want_is_not_decoded(
@@ -189,7 +199,8 @@ def test_a_view_the_scan_cannot_want_is_not_decoded(
     scanner = Scanner(circle_estimator(), ScanSettings(keep="first", max_views=2))
     send_views(scanner, bag_messages, 1, 1.5)
     monkeypatch.setattr("relpose_ros.scanning.image_decoding.decode_image", None)
-    assert not any(receipt.rejected for receipt in send_views(scanner, bag_messages, 1, 1.5, 3))
+    receipts = send_views(scanner, bag_messages, 1, 1.5, 3)
+    assert [receipt.rejected for receipt in receipts] == [True, True, False]
 
 
 def test_statistics_tell_the_state_of_each_scan(messages: Any, circle_estimator: Callable[..., Any]) -> None:
