@@ -25,6 +25,7 @@ from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -206,17 +207,19 @@ class ScanNode(LifecycleNode):
         try:
             estimator = self._load_estimator()
         except (RelPoseError, OSError) as err:
-            self._failure = str(err)
             name = self.get_fully_qualified_name()
             how = f"`ros2 param set {name} weights FILE`, {lifecycle(name, *FORTH)}"
-            self.get_logger().error(f"{err} Then, or with other weights: {how}.")
-            return TransitionCallbackReturn.FAILURE
+            return self._fail(f"{err} Then, or with other weights: {how}.")
         if self._closing:
             return TransitionCallbackReturn.FAILURE
         self._estimator, self._scanner = estimator, Scanner(estimator, self._settings)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="estimate")
-        self._make_outputs()
-        self._make_inputs(self._scanner)
+        try:
+            self._make_outputs()
+            self._make_inputs(self._scanner)
+        except (RuntimeError, ParameterException) as err:  # rclpy's own errors are RuntimeErrors
+            self._release()
+            return self._fail(f"The qos_overrides given are refused: {err}. Start the node with others.")
         for name, callback, group in (
             ("~/reset", self._on_reset, None),
             ("~/drop_last_view", self._on_drop_last_view, None),
@@ -268,6 +271,11 @@ class ScanNode(LifecycleNode):
         return super().on_error(state)
 
     # What configuring makes.
+
+    def _fail(self, failure: str) -> TransitionCallbackReturn:
+        self._failure = failure
+        self.get_logger().error(failure)
+        return TransitionCallbackReturn.FAILURE
 
     def _load_estimator(self) -> Estimator:
         weights, threads = self._settings.weights_path, self._settings.threads

@@ -35,12 +35,14 @@ def declare_parameters(node: Node) -> ScanSettings:
     Raises:
         SettingsError: A given value has the wrong type or lies outside its range.
     """
+    values = {}
     for each in fields(ScanSettings):
         try:
             node.declare_parameter(each.name, _as_parameter(each.default), _descriptor(each))
+            values[each.name] = node.get_parameter(each.name).value
         except ParameterException as err:
             raise SettingsError(f"The value given for {each.name} is refused: {err}.") from err
-    return ScanSettings.from_mapping({name: node.get_parameter(name).value for name in NAMES})
+    return ScanSettings.from_mapping(values)
 
 
 def unknown_parameters(given: Iterable[str], overridable: Iterable[str]) -> list[str]:
@@ -77,6 +79,8 @@ def changed_settings(
     for name, value in wanted.items():
         if value is None:
             raise SettingsError(f"{name} cannot be unset: give it a value.")
+        if configured and name == "autostart":
+            raise SettingsError("autostart is read when the node starts: give it there.")
         if configured and name in ONLY_UNCONFIGURED:
             text = f"{name} is read when the node is configured. First {lifecycle(configured, *BACK)}; then"
             raise SettingsError(f"{text} set it, and {lifecycle(configured, *FORTH)}.")

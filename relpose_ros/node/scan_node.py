@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import rclpy
+from rclpy.exceptions import ParameterException
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args, try_shutdown
@@ -47,7 +48,7 @@ def run_node(args: Sequence[str] | None = None) -> int:
                 return _refuse(f"{' '.join(unknown)} is no argument of the node: ROS's follow --ros-args.")
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
             node = ScanNode()
-        except (SettingsError, RuntimeError) as err:  # rclpy's errors are RuntimeErrors
+        except (SettingsError, ParameterException, RuntimeError) as err:  # most of rclpy's are RuntimeErrors
             try_shutdown()
             return _refuse(str(err))
         with _forwarded_log(node):

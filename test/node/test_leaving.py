@@ -99,6 +99,19 @@ def test_without_autostart_it_waits_for_a_manager(
     assert node.end() == 0
 
 
+@pytest.mark.parametrize("override", ["reliability:=relyable", "depth:=deep", "depth:=-3"])
+def test_a_qos_override_that_cannot_be_is_told(
+    override: str, start_without_network: Callable[..., Any], new_graph: Any
+) -> None:
+    node = start_without_network(f"qos_overrides./image.subscription.{override}")
+    node.wait_for("ERROR", "The qos_overrides given are refused")
+    assert not node.told("Traceback"), list(node.lines)
+    assert "qos_overrides" in new_graph.diagnostics().message
+    assert new_graph.state() == "unconfigured"
+    assert new_graph.node.count_publishers("/scan_node/estimate") == 0, "what was made is released"
+    assert node.end() == 0
+
+
 def test_a_misspelt_parameter_is_told(
     start_without_network: Callable[..., Any], new_graph: Any, tmp_path: Path
 ) -> None:
@@ -127,6 +140,8 @@ def test_a_misspelt_parameter_is_told(
         (["--ros-args", "-p", "max_views:=9"], ["max_views", "9"]),
         (["--ros-args", "-p", "keep:=some"], ["keep", "'some'", "spread"]),
         (["--ros-args", "-p", "backward_jump_s:=soon"], ["backward_jump_s", "soon"]),
+        (["--ros-args", "-p", "image_transports:=[]"], ["image_transports"]),
+        (["--ros-args", "-p", "qos_overrides./diagnostics.publisher.depth:=deep"], ["qos_overrides", "deep"]),
         (["--help-me"], ["--help-me", "--ros-args"]),
         (["--ros-args", "--params-file", "nowhere.yaml"], ["nowhere.yaml"]),
     ],
