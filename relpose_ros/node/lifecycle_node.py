@@ -49,6 +49,7 @@ from relpose_ros.node.reports import (
     loss_advice,
     pairing_advice,
     qos_advice,
+    twin_advice,
 )
 from relpose_ros.scanning.scanner import Scanner
 from relpose_ros.scanning.settings import SettingsError
@@ -136,6 +137,7 @@ class ScanNode(LifecycleNode):
         super().__init__("scan_node", **kwargs)
         self._settings = declare_parameters(self)
         self._ignored = self._tell_unknown_parameters()
+        self._advice = self._ignored
         self._scanner: Scanner | None = None
         self._estimator: Estimator | None = None
         self._worker: ThreadPoolExecutor | None = None
@@ -156,7 +158,6 @@ class ScanNode(LifecycleNode):
         self._lost: dict[str, int] = {}
         self._throttle = Throttle()
         self._loss_throttle = Throttle(LOSS_REPEAT_AFTER_S)
-        self._unpaired = ""
         # A service that waits for an estimate must not hold up the callbacks of images.
         self._waiting_group = MutuallyExclusiveCallbackGroup()
         self._diagnostics = self.create_publisher(
@@ -543,19 +544,22 @@ class ScanNode(LifecycleNode):
     def _look_after_itself(self) -> None:
         scanner = self._scanner
         statistics = scanner.statistics() if scanner is not None else None
-        self._tell_unpaired(statistics)
+        told, self._advice = self._advice, [*self._advice_on_topics(statistics), *self._ignored]
+        for sentence in self._advice:
+            if sentence not in told:
+                self.get_logger().warning(sentence)
         if self._settings.diagnostics:
             self._publish_diagnostics(statistics)
 
-    def _tell_unpaired(self, statistics: Statistics | None) -> None:
-        """Images without camera infos: nothing is wrong with any message, and yet nothing happens."""
-        before, self._unpaired = self._unpaired, ""
-        if statistics is None or (statistics.unpaired_s or 0.0) < UNPAIRED_AFTER_S:
-            return
-        topic = self.resolve_topic_name(CAMERA_INFO[1])
-        self._unpaired = pairing_advice(topic, self._publishers_of.get(topic, 0))
-        if self._unpaired != before:
-            self.get_logger().warning(self._unpaired)
+    def _advice_on_topics(self, statistics: Statistics | None) -> list[str]:
+        """About what no single message shows."""
+        advice = []
+        estimates, infos = self.resolve_topic_name(OUTPUTS[0][0]), self.resolve_topic_name(CAMERA_INFO[1])
+        if self.count_publishers(estimates) > 1:
+            advice.append(twin_advice(estimates))
+        if statistics is not None and (statistics.unpaired_s or 0.0) > UNPAIRED_AFTER_S:
+            advice.append(pairing_advice(infos, self._publishers_of.get(infos, 0)))
+        return advice
 
     def _publish_diagnostics(self, statistics: Statistics | None) -> None:
         health = NodeHealth(
@@ -566,8 +570,7 @@ class ScanNode(LifecycleNode):
             lost=dict(self._lost),
             longest_callbacks_s=dict(self._longest_callback_s),
             incompatible=self._incompatible_now(),
-            unpaired=self._unpaired,
-            ignored=self._ignored,
+            advice=self._advice,
         )
         status = diagnostic_status(self.get_fully_qualified_name(), health, statistics)
         message = DiagnosticArray(status=[status])

@@ -114,6 +114,11 @@ def pairing_advice(topic: str, publishers: int) -> str:
     return f"Images come in, but no message on {topic} has the stamp of one: give both the same header.stamp."
 
 
+def twin_advice(topic: str) -> str:
+    """What to do about another node that publishes our topic."""
+    return f"Somebody else publishes {topic} too: start one of two nodes with `-r __node:=NAME`."
+
+
 @dataclass(frozen=True)
 class NodeHealth:
     """What the node knows of itself, beside its scanner's statistics."""
@@ -132,10 +137,8 @@ class NodeHealth:
     """The slowest callback so far, by topic."""
     incompatible: Mapping[str, str] = field(default_factory=dict)
     """What to do about QoS that does not fit, by topic."""
-    unpaired: str = ""
-    """What to do about images without camera infos; empty where there is nothing to do."""
-    ignored: Sequence[str] = ()
-    """A sentence about each parameter that was given and does not exist."""
+    advice: Sequence[str] = ()
+    """What else a person ought to know and do, a sentence each."""
 
 
 def diagnostic_status(name: str, health: NodeHealth, statistics: Statistics | None) -> DiagnosticStatus:
@@ -145,16 +148,14 @@ def diagnostic_status(name: str, health: NodeHealth, statistics: Statistics | No
         views = sum(scan.views for scan in statistics.scans.values())
         message = f"{health.state}, objects: {len(statistics.scans)}, views: {views}"
     failure = statistics.last_failure if statistics is not None and health.failing else ""
-    warnings = [*health.incompatible.values(), failure, health.unpaired, *health.ignored]
+    warnings = [*health.incompatible.values(), failure, *health.advice]
     worst = next(filter(None, warnings), "")
     if worst:
         level, message = DiagnosticStatus.WARN, worst
     if health.failure:
         level, message = DiagnosticStatus.ERROR, health.failure
     values = [("state", health.state)]
-    values += (("parameter", sentence) for sentence in health.ignored)
-    if health.unpaired:
-        values.append(("camera info", health.unpaired))
+    values += (("advice", sentence) for sentence in health.advice)
     values += ((f"{topic} QoS", advice) for topic, advice in health.incompatible.items())
     values += ((f"{topic} publishers", str(count)) for topic, count in health.publishers.items())
     values += ((f"{topic} lost", str(count)) for topic, count in health.lost.items())

@@ -119,11 +119,9 @@ def test_diagnostics_tell_the_worst_first() -> None:
     deaf = replace(healthy, incompatible={"/image": "set the QoS"})
     told = diagnostic_status("/scan_node", deaf, statistics)
     assert (told.level, told.message) == (DiagnosticStatus.WARN, "set the QoS")
-    unpaired = diagnostic_status("/scan_node", replace(healthy, unpaired="no camera info"), statistics)
-    assert (unpaired.level, unpaired.message) == (DiagnosticStatus.WARN, "no camera info")
-    misspelt = diagnostic_status("/scan_node", replace(healthy, ignored=["no such name"]), statistics)
-    assert (misspelt.level, misspelt.message) == (DiagnosticStatus.WARN, "no such name")
-    assert ("parameter", "no such name") in [(each.key, each.value) for each in misspelt.values]
+    advised = diagnostic_status("/scan_node", replace(healthy, advice=["do this", "do that"]), statistics)
+    assert (advised.level, advised.message) == (DiagnosticStatus.WARN, "do this")
+    assert [each.value for each in advised.values if each.key == "advice"] == ["do this", "do that"]
     lost = replace(deaf, state="unconfigured", failure="no such weights")
     told = diagnostic_status("/scan_node", lost, None)
     assert (told.level, told.message) == (DiagnosticStatus.ERROR, "no such weights")

@@ -245,7 +245,17 @@ def test_images_without_camera_infos_are_told(node: Any, graph: Any, make: Any) 
         graph.publish(IMAGE, make.image(100 + stamp))
         graph.publish(CAMERA_INFO, make.camera_info(100 + stamp))
 
-    graph.publish_until(lambda: graph.diagnostic("camera info") is None, "its end", publish_both)
+    graph.publish_until(lambda: graph.diagnostic("advice") is None, "its end", publish_both)
+
+
+def test_another_node_of_the_same_name_is_told(node: Any, graph: Any) -> None:
+    twin = graph.node.create_publisher(ScanEstimate, "/scan_node/estimate", LAST)
+    try:
+        node.wait_for("WARN", "Somebody else publishes /scan_node/estimate", "__node:=NAME")
+        assert "Somebody else" in graph.diagnostics().message
+    finally:
+        graph.node.destroy_publisher(twin)
+    graph.wait_until(lambda: graph.diagnostic("advice") is None, "its end")
 
 
 def test_parameters_are_described_and_judged(node: Any, graph: Any) -> None:
