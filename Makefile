@@ -61,6 +61,11 @@ $(VENV)/.relpose_ros-build-tools: build_support/requirements.txt constraints.txt
 	@$(pip_install) --requirement build_support/requirements.txt
 	@touch $@
 
+# After `pip uninstall relpose_ros` the stamp alone would say that all is there.
+ifeq ($(wildcard $(BIN)/relpose_ros),)
+.PHONY: $(VENV)/.relpose_ros-installed
+endif
+
 $(VENV)/.relpose_ros-installed: $(VENV)/.relpose_ros-build-tools $(INSTALLED)
 	@echo "Installing relpose_ros into $(VENV)."
 	@$(pip_install) --no-build-isolation --editable '.[ros,train,evaluate,dev]'
