@@ -75,16 +75,19 @@ def changed_settings(
     Raises:
         SettingsError: A value is refused, or comes too late.
     """
+    current = {name: getattr(settings, name) for name in NAMES}
     wanted = {each.name: each.value for each in parameters if each.name in NAMES}
     for name, value in wanted.items():
         if value is None:
             raise SettingsError(f"{name} cannot be unset: give it a value.")
-        if configured and name == "autostart":
+        # `ros2 param load` sets all parameters of a file, most of them to what they are.
+        if not configured or value == _as_parameter(current[name]):
+            continue
+        if name == "autostart":
             raise SettingsError("autostart is read when the node starts: give it there.")
-        if configured and name in ONLY_UNCONFIGURED:
+        if name in ONLY_UNCONFIGURED:
             text = f"{name} is read when the node is configured. First {lifecycle(configured, *BACK)}; then"
             raise SettingsError(f"{text} set it, and {lifecycle(configured, *FORTH)}.")
-    current = {name: getattr(settings, name) for name in NAMES}
     return ScanSettings.from_mapping(current | wanted)
 
 

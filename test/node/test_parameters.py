@@ -83,11 +83,13 @@ def test_several_parameters_change_together() -> None:
     assert changed == ScanSettings(max_scans=2, max_views=5, keep="latest")
 
 
+OTHER_VALUES = {"weights": "mine.safetensors", "threads": 3, "image_transports": ["raw"], "autostart": False}
+
+
 @pytest.mark.parametrize("name", sorted(ONLY_UNCONFIGURED - {"autostart"}))
 def test_what_is_read_once_changes_only_before(name: str) -> None:
-    default = SETTINGS[name].default
-    wanted = [Parameter(name, value=list(default) if isinstance(default, tuple) else default)]
-    assert changed_settings(ScanSettings(), wanted) == ScanSettings()
+    wanted = [Parameter(name, value=OTHER_VALUES[name])]
+    assert changed_settings(ScanSettings(), wanted) != ScanSettings()
     with pytest.raises(SettingsError) as refused:
         changed_settings(ScanSettings(), wanted, configured="/lab/scan_node")
     commands = re.findall(r"`ros2 lifecycle set /lab/scan_node (\w+)`", str(refused.value))
@@ -98,6 +100,16 @@ def test_what_is_read_once_changes_only_before(name: str) -> None:
 def test_autostart_is_over_once_the_node_is_configured() -> None:
     with pytest.raises(SettingsError, match="autostart is read when the node starts"):
         changed_settings(ScanSettings(), [Parameter("autostart", value=False)], configured="/scan_node")
+
+
+def test_a_parameter_may_be_set_to_what_it_is() -> None:
+    """As `ros2 param load` does with the shipped file."""
+    same = [
+        Parameter(name, value=list(each.default) if isinstance(each.default, tuple) else each.default)
+        for name, each in SETTINGS.items()
+    ]
+    assert changed_settings(ScanSettings(), same, configured="/scan_node") == ScanSettings()
+    assert set(OTHER_VALUES) == ONLY_UNCONFIGURED
 
 
 QOS = "qos_overrides./image.subscription.reliability"
