@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from relpose_ros.errors import RelPoseError
-from relpose_ros.estimates import CameraPose, ScanEstimate
-from relpose_ros.geometry import cameras
+from relpose_ros.estimates import CameraPose, ScanEstimate, Verdict
+from relpose_ros.geometry import cameras, so3_grid
 from relpose_ros.inference import bundle_adjustment
 from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.camera_positions import baseline, place
@@ -22,10 +22,16 @@ from relpose_ros.inference.evidence import SHIPPED, EvidenceSettings
 from relpose_ros.inference.global_rotations import joint_scores, solve
 from relpose_ros.inference.matches import Matcher, peaks
 from relpose_ros.inference.pair_distribution import search
-from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
+from relpose_ros.inference.pair_energies import COARSE_LEVEL, GridEmbeddings, PairEnergies
+from relpose_ros.inference.predictions import predicted_translations, regressed_poses
 from relpose_ros.inference.rotation_evidence import RotationEvidence
-from relpose_ros.inference.uncertainty import camera_covariances, describe_pairs
-from relpose_ros.inference.verdict import judge
+from relpose_ros.inference.uncertainty import (
+    camera_covariances,
+    covariances_of_unknown_trust,
+    describe_pairs,
+    pairs_of_unknown_trust,
+)
+from relpose_ros.inference.verdict import WITHOUT_PROBABILITIES, judge
 from relpose_ros.network.checkpoint import load_network, read_metadata
 from relpose_ros.network.crops import crop_view
 from relpose_ros.network.features import ViewFeatures
@@ -36,6 +42,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
+    from relpose_ros.estimates import PairRotation
     from relpose_ros.inference.matches import TwoViewGeometry
     from relpose_ros.inference.pair_distribution import PairDistributions
     from relpose_ros.network.features import SceneFeatures
@@ -72,6 +79,21 @@ class _Found:
         return replace(self.energies, weight=2 / self.energies.views)
 
 
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """What there is to tell of a scan, the first camera at distance 1."""
+
+    rotations: FloatArray
+    """(N, 3, 3) camera_from_object."""
+    centres: FloatArray
+    """(N, 3)."""
+    covariances: FloatArray
+    """(N, 6, 6)."""
+    pairs: tuple[PairRotation, ...]
+    score: float
+    verdict: tuple[Verdict, int, str]
+
+
 CONTRADICTION = 0.5
 """Nats a pair: refined poses that lose more of the joint energy contradict the pairs, and are not taken."""
 
@@ -82,6 +104,9 @@ class Estimator:
     The same scan gives the same answer to the bit, whatever was estimated before it: a view's features are
     computed from that view alone and kept as long as the view is, and nothing else is remembered.
     Safe to call from several threads; one estimate is made at a time.
+
+    A network that regresses poses has no distribution which matches could join and no calibration: its poses
+    are told as they are, as uncertain as can be, and never called enough.
     """
 
     def __init__(
@@ -98,9 +123,10 @@ class Estimator:
             evidence: what else to rest on.
         """
         self._network = network.eval()
-        self._calibration = calibration
+        self._regresses = network.preset.rotation == "regression"
+        self._calibration = None if self._regresses else calibration
         self._evidence = evidence
-        self._matcher = _matcher(evidence)
+        self._matcher = self._matcher_of(evidence)
         self._grid = GridEmbeddings(network)
         self._looks: WeakKeyDictionary[View, tuple[ViewFeatures, torch.Tensor]] = WeakKeyDictionary()
         self._lock = threading.Lock()
@@ -132,7 +158,7 @@ class Estimator:
         """Goes on with other evidence from the next estimate on."""
         with self._lock:
             if evidence != self._evidence:
-                self._evidence, self._matcher = evidence, _matcher(evidence)
+                self._evidence, self._matcher = evidence, self._matcher_of(evidence)
 
     @torch.no_grad()
     def estimate(self, scan: Scan) -> ScanEstimate:
@@ -148,31 +174,20 @@ class Estimator:
             )
         with self._lock:
             start = time.perf_counter()
-            found = self._search(scan)
-            solutions = solve(found.joint_energies, found.distributions)
-            solution = solutions.rotations[0]
-            translations = self._network.optical_translations(found.features).double().numpy()
-            translations = translations / max(float(np.linalg.norm(translations[0])), 1e-6)
-            covariances = camera_covariances(
-                found.distributions, found.energies, solution, translations, found.calibration
-            )
-            rotations, centres, covariances = self._place(
-                scan, found, solution.numpy(), translations, covariances
-            )
-            solution = torch.from_numpy(rotations)
+            told = self._regressed(scan) if self._regresses else self._solved(scan)
             unit = self._evidence.first_view_distance or 1.0
+            covariances = told.covariances.copy()
             covariances[:, :3] *= unit
             covariances[:, :, :3] *= unit
-            pairs = describe_pairs(found.distributions, found.energies, solution, found.calibration)
-            verdict, weakest, status = judge(pairs, covariances, self._calibration is not None)
+            verdict, weakest, status = told.verdict
             return ScanEstimate(
                 object_id=scan.object_id,
                 cameras=tuple(
-                    CameraPose(view, rotations[view].T, unit * centres[view], covariances[view])
+                    CameraPose(view, told.rotations[view].T, unit * told.centres[view], covariances[view])
                     for view in range(len(scan.views))
                 ),
-                pairs=pairs,
-                score=float(joint_scores(found.energies, solution[None])[0]),
+                pairs=told.pairs,
+                score=told.score,
                 scale_known=self._evidence.first_view_distance > 0,
                 calibrated=self._calibration is not None,
                 verdict=verdict,
@@ -188,6 +203,10 @@ class Estimator:
         Pairs i < j, ordered by i, then j; rotations are camera_j_from_camera_i.
         """
         with self._lock:
+            if self._regresses:
+                cells = so3_grid.grid(COARSE_LEVEL)
+                count = len(scan.views) * (len(scan.views) - 1) // 2
+                return [(cells, np.full(len(cells), 1 / len(cells)))] * count
             distributions = self._search(scan).distributions
             return [
                 (rotations.numpy(), masses.numpy())
@@ -197,8 +216,44 @@ class Estimator:
     @torch.no_grad()
     def rotations(self, features: SceneFeatures) -> FloatArray:
         """The jointly best rotations, camera_from_object, the first the identity. -> (N, 3, 3)."""
+        if self._regresses:
+            return regressed_poses(self._network, features)[0]
         energies = PairEnergies.of(self._network, features, len(features))
         return np.asarray(solve(energies, search(energies, self._grid)).rotations[0].numpy())
+
+    def _solved(self, scan: Scan) -> _Told:
+        """What the pairs' distributions say together."""
+        found = self._search(scan)
+        solution = solve(found.joint_energies, found.distributions).rotations[0]
+        translations = predicted_translations(self._network, found.features, solution.numpy())
+        covariances = camera_covariances(
+            found.distributions, found.energies, solution, translations, found.calibration
+        )
+        rotations, centres, covariances = self._place(
+            scan, found, solution.numpy(), translations, covariances
+        )
+        solution = torch.from_numpy(rotations)
+        pairs = describe_pairs(found.distributions, found.energies, solution, found.calibration)
+        return _Told(
+            rotations,
+            centres,
+            covariances,
+            pairs,
+            score=float(joint_scores(found.energies, solution[None])[0]),
+            verdict=judge(pairs, covariances, self._calibration is not None),
+        )
+
+    def _regressed(self, scan: Scan) -> _Told:
+        """What a network says that gives one pose a view, and no probability of it."""
+        rotations, translations = regressed_poses(self._network, self._features(scan))
+        return _Told(
+            rotations,
+            cameras.camera_centre(rotations, translations),
+            covariances_of_unknown_trust(rotations, translations, Calibration()),
+            pairs_of_unknown_trust(rotations),
+            score=0.0,
+            verdict=(Verdict.ONE_MORE_VIEW, 0, WITHOUT_PROBABILITIES),
+        )
 
     def _search(self, scan: Scan) -> _Found:
         """Everything that is known of the pairs before their rotations are brought together."""
@@ -271,6 +326,6 @@ class Estimator:
         stacked = torch.stack([crop_parameters for _, crop_parameters in looks])
         return self._network.relate(ViewFeatures.stack([look for look, _ in looks]), stacked)
 
-
-def _matcher(evidence: EvidenceSettings) -> Matcher | None:
-    return None if evidence.use == "network" else Matcher(surroundings=evidence.surroundings)
+    def _matcher_of(self, evidence: EvidenceSettings) -> Matcher | None:
+        alone = self._regresses or evidence.use == "network"
+        return None if alone else Matcher(surroundings=evidence.surroundings)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import camera_centre, closest_point_to_axes
 
 if TYPE_CHECKING:
@@ -61,5 +62,6 @@ def regressed_poses(network: RelPose, features: SceneFeatures) -> tuple[FloatArr
     Raises:
         NetworkUseError: The preset scores rotations instead: use `Estimator`.
     """
-    rotations = network.optical_rotations(features).double().cpu().numpy()
+    rotations = so3.project(network.optical_rotations(features).double().cpu().numpy())
+    rotations = rotations @ rotations[0].T  # the identity to the last digit, not to float32's
     return rotations, predicted_translations(network, features, rotations)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +35,9 @@ SURE = 0.85
 alone."""
 FLOOR = math.radians(0.1)
 """The solver's own accuracy, rad: the standard deviation stated for what the gauge fixes by definition."""
+UNIFORM_VARIANCE = (math.pi**2 / 3 + 2) / 3
+"""Of each component of a rotation vector whose rotation may be any, rad^2: angles a have density
+(1 - cos a) / pi."""
 
 
 def describe_pairs(
@@ -95,6 +99,39 @@ def describe_pairs(
             )
         )
     return tuple(pairs)
+
+
+def pairs_of_unknown_trust(rotations: FloatArray) -> tuple[PairRotation, ...]:
+    """Every pair of poses that came without a distribution: all that is sure is the uniform one.
+
+    Args:
+        rotations: (N, 3, 3) camera_from_object.
+    """
+    covariance = UNIFORM_VARIANCE * np.eye(3)
+    pairs = []
+    for i, j in combinations(range(len(rotations)), 2):
+        relative = rotations[j] @ rotations[i].T
+        pairs.append(
+            PairRotation(
+                i=i,
+                j=j,
+                camera_j_from_camera_i=relative,
+                covariance=covariance,
+                entropy=0.0,
+                probability_within_15_deg=_uniform_share(WITHIN),
+                modes=(Mode(relative, _uniform_share(BASIN), covariance),),
+                ambiguous=False,
+                ambiguity_angle=0.0,
+                solution_probability=_uniform_share(WITHIN),
+                solution_angle=0.0,
+            )
+        )
+    return tuple(pairs)
+
+
+def _uniform_share(radius: float) -> float:
+    """Of all rotations, those within an angle of a given one."""
+    return (radius - math.sin(radius)) / math.pi
 
 
 def _evidence(energies: PairEnergies, pair: int) -> Evidence:
@@ -191,15 +228,40 @@ def camera_covariances(
     Returns:
         (N, 6, 6): x, y, z, rotation about X, Y, Z, fixed axes of the object frame.
     """
-    spread = _joint_spread(distributions, energies, solution, calibration) + FLOOR**2 * np.eye(3)
+    spread = _joint_spread(distributions, energies, solution, calibration)
+    return _in_object_frame(spread, solution.numpy(), translations, calibration)
+
+
+def covariances_of_unknown_trust(
+    rotations: FloatArray, translations: FloatArray, calibration: Calibration
+) -> FloatArray:
+    """As `camera_covariances`, of poses that came without a distribution.
+
+    Any camera but the first, which the gauge fixes, may look any way.
+
+    Args:
+        rotations: (N, 3, 3) camera_from_object.
+        translations: (N, 3), as there.
+        calibration: whose ``translation_sigma`` counts.
+    """
+    spread = np.repeat(UNIFORM_VARIANCE * np.eye(3)[None], len(rotations), 0)
+    spread[0] = 0
+    return _in_object_frame(spread, rotations, translations, calibration)
+
+
+def _in_object_frame(
+    turns: FloatArray, rotations: FloatArray, translations: FloatArray, calibration: Calibration
+) -> FloatArray:
+    """Covariances (N, 6, 6) of poses from those of the cameras' turns, (N, 3, 3) in the cameras' own axes."""
+    spread = turns + FLOOR**2 * np.eye(3)
     sigma = np.diag(np.square(calibration.translation_sigma))
-    shifts = np.repeat(sigma[None], energies.views, 0)
+    shifts = np.repeat(sigma[None], len(rotations), 0)
     # By definition of the unit of length the first camera's distance is one.
     direction = translations[0] / np.linalg.norm(translations[0])
     across = np.eye(3) - np.outer(direction, direction)
     shifts[0] = across @ sigma @ across + FLOOR**2 * np.eye(3)
-    covariances = np.zeros((energies.views, 6, 6))
-    for camera, object_from_camera in enumerate(solution.mT.numpy()):
+    covariances = np.zeros((len(rotations), 6, 6))
+    for camera, object_from_camera in enumerate(rotations.transpose(0, 2, 1)):
         # A turn e of the camera (axes of the camera, left perturbation of camera_from_object) is the turn
         # -R^T e in the object's axes, and moves the centre -R^T t by -R^T (t x e).
         turn = np.concatenate([-object_from_camera @ so3.hat(translations[camera]), -object_from_camera])

@@ -31,6 +31,13 @@ LARGEST_DEVIATION = math.radians(12)
 """Largest standard deviation (worst axis) of a camera's rotation: within 15 degrees more often than not."""
 
 
+WITHOUT_PROBABILITIES = (
+    "one more view: this network regresses poses and cannot say how far to trust them, so that none of its "
+    "estimates can be called enough"
+)
+"""The verdict on poses that come without a distribution, in words."""
+
+
 def judge(
     pairs: Sequence[PairRotation], covariances: npt.NDArray[np.float64], calibrated: bool
 ) -> tuple[Verdict, int, str]:

@@ -14,7 +14,9 @@ from relpose_ros.inference import bundle_adjustment, matches
 from relpose_ros.inference.bundle_adjustment import Refined
 from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.estimator import Estimator, EvidenceSettings, ScanError
+from relpose_ros.inference.predictions import regressed_poses
 from relpose_ros.network.checkpoint import random_network, write_network
+from relpose_ros.network.presets import named_preset
 from relpose_ros.views import BoundingBox, Scan, View
 
 
@@ -168,6 +170,78 @@ def test_rotations_of_features(network):
         features = estimator._features(views)
     expected = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
     np.testing.assert_array_equal(estimator.rotations(features), expected)
+
+
+def test_a_network_that_predicts_in_the_first_cameras_frame_gives_the_same_object_frame():
+    """Its translations are about the first camera's place; the object's is where the axes meet."""
+    network = random_network(named_preset("compact", ["first-camera"]), 1)
+    estimate = Estimator(network, evidence=EvidenceSettings("network")).estimate(scan(0, 1, 2))
+    rotations = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
+    centres = np.stack([camera.position for camera in estimate.cameras])
+    np.testing.assert_allclose(cameras.closest_point_to_axes(rotations, centres), np.zeros(3), atol=1e-6)
+    assert np.linalg.norm(centres[0]) == pytest.approx(1)
+
+
+# A network that regresses poses has no probabilities to tell.
+
+
+@pytest.fixture(scope="module", params=[("regression",), ("regression", "first-camera")], ids="+".join)
+def regressing(request):
+    return random_network(named_preset("compact", request.param), 1)
+
+
+def test_regressed_poses_come_through_the_same_door(regressing):
+    estimator = Estimator(regressing)
+    views = scan(0, 1, 2)
+    estimate = estimator.estimate(views)
+    with torch.no_grad():
+        features = estimator._features(views)
+    rotations, translations = regressed_poses(regressing, features)
+    np.testing.assert_array_equal(estimator.rotations(features), rotations)
+    for view, camera in enumerate(estimate.cameras):
+        np.testing.assert_array_equal(camera.object_from_camera, rotations[view].T)
+        centre = cameras.camera_centre(rotations[view], translations[view])
+        np.testing.assert_allclose(camera.position, centre, atol=1e-12)
+    np.testing.assert_allclose(rotations[0], np.eye(3), atol=1e-14)
+    assert so3.angle_between(rotations[1], rotations[0]) > 0.01
+
+
+def test_regressed_poses_are_never_called_enough(regressing, ball):
+    """Though matches agree on this scan, and somebody gave the weights a calibration."""
+    estimate = Estimator(regressing, CALIBRATED).estimate(ball)
+    assert not estimate.calibrated
+    assert estimate.verdict is Verdict.ONE_MORE_VIEW
+    assert "regresses poses and cannot say how far to trust them" in estimate.status
+    for pair in estimate.pairs:
+        true = estimate.cameras[pair.j].object_from_camera.T @ estimate.cameras[pair.i].object_from_camera
+        np.testing.assert_allclose(pair.camera_j_from_camera_i, true, atol=1e-12)
+        assert pair.evidence == Evidence.LEARNED
+        assert pair.entropy == 0
+    for camera in estimate.cameras[1:]:
+        assert np.linalg.eigvalsh(camera.covariance)[0] > 0
+        assert np.degrees(np.sqrt(np.linalg.eigvalsh(camera.covariance[3:, 3:]).min())) > 70
+
+
+def test_what_is_said_of_regressed_pairs_is_the_uniform_distribution(regressing, ball):
+    pair = Estimator(regressing).estimate(ball).pairs[0]
+    draws = so3.log(so3.random_rotations(200_000, np.random.default_rng(0)))
+    np.testing.assert_allclose(pair.covariance, draws.T @ draws / len(draws), atol=0.02)
+    angles = np.linalg.norm(draws, axis=1)
+    assert pair.probability_within_15_deg == pytest.approx((angles < np.radians(15)).mean(), rel=0.15)
+    assert pair.modes[0].weight == pytest.approx((angles < np.radians(30)).mean(), rel=0.1)
+    ((_, masses), *others) = Estimator(regressing).pair_masses(ball)
+    assert len(others) == 2
+    assert masses.sum() == pytest.approx(1)
+    assert np.ptp(masses) == 0
+
+
+def test_regressed_poses_in_metres(regressing):
+    plain, metric = (
+        Estimator(regressing, evidence=EvidenceSettings(first_view_distance=distance)).estimate(scan(0, 1))
+        for distance in (0.0, 0.6)
+    )
+    np.testing.assert_allclose(metric.cameras[1].position, 0.6 * plain.cameras[1].position)
+    assert metric.scale_known
 
 
 # What the pictures themselves say: a ball on a turntable before a background that stays.

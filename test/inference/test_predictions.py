@@ -57,7 +57,7 @@ def test_poses_are_the_same_whichever_origin_they_were_learned_about(seed, views
     ):
         np.testing.assert_allclose(predicted_translations(oracle, None, rotations), expected, atol=1e-6)
         turned, moved = regressed_poses(oracle, None)
-        np.testing.assert_allclose(turned, rotations)
+        np.testing.assert_allclose(turned, rotations, atol=1e-12)
         np.testing.assert_allclose(moved, expected, atol=1e-6)
 
 
@@ -78,9 +78,9 @@ def test_a_network_that_regresses_gives_poses(variants):
     rotations, translations = regressed_poses(network, features)
     assert rotations.dtype == translations.dtype == np.float64
     np.testing.assert_allclose(
-        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (4, 1, 1)), atol=1e-5
+        rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (4, 1, 1)), atol=1e-12
     )
-    np.testing.assert_allclose(rotations[0], np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(rotations[0], np.eye(3), atol=1e-14)
     assert np.linalg.norm(translations[0]) == pytest.approx(1)
 
 
