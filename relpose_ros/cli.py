@@ -17,7 +17,9 @@ from relpose_ros.errors import RelPoseError
 from relpose_ros.network.presets import PRESETS, VARIANTS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
+
+    from relpose_ros.evaluation.protocol import PosedViews
 
     Run = Callable[[argparse.Namespace], int]
 
@@ -75,13 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     replay.add_argument("bag", type=Path, help="rosbag2 folder, or a single .mcap or .db3 file")
     replay.add_argument("--output", type=Path, required=True, metavar="DIR", help="where the results go")
-    replay.add_argument(
-        "--topic",
-        action="append",
-        metavar="NAME",
-        help="topic of images or ObjectView; again for more (default: all ObjectView topics, else the images "
-        "of the camera, where there is but one)",
-    )
+    _add_topics(replay)
     replay.add_argument(
         "--config",
         type=Path,
@@ -116,7 +112,13 @@ def _parser() -> argparse.ArgumentParser:
         _evaluate,
         "Measure poses on captures that have them, by the paper's protocol, beside baselines.",
     )
-    evaluate.add_argument("capture", type=Path, nargs="+", help="capture folders with camera poses")
+    evaluate.add_argument(
+        "capture",
+        type=Path,
+        nargs="+",
+        help="capture folder with camera poses; bag with a topic ground_truth/pose; category of CO3Dv2, or "
+        "the folder of all categories",
+    )
     evaluate.add_argument(
         "--views",
         type=_view_counts,
@@ -127,6 +129,26 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--method", action="append", metavar="NAME", help="method to measure; again for more (default: all)"
     )
+    evaluate.add_argument(
+        "--variant",
+        action="append",
+        type=_home_path,
+        default=[],
+        metavar="FILE",
+        help="weights of a variant (train --variant), measured beside the methods in rows that bear its "
+        "name, such as regression; again for more",
+    )
+    evaluate.add_argument(
+        "--no-masks", action="store_true", help="give the boxes alone, as where nobody segmented the object"
+    )
+    evaluate.add_argument(
+        "--split",
+        choices=("held_out", "train"),
+        default="held_out",
+        help="which categories of CO3Dv2, where a folder holds them all: the paper's ten that training does "
+        "not see (default), or the others",
+    )
+    _add_topics(evaluate)
     evaluate.add_argument(
         "--orders",
         type=int,
@@ -249,6 +271,17 @@ def _add_weights(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_topics(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--topic",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="topic of images or ObjectView in a bag; again for more (default: all ObjectView topics, else "
+        "the images of the camera, where there is but one)",
+    )
+
+
 def _home_path(text: str) -> Path:
     """A path that may begin with ~, which shells leave alone in ``--weights=~/file``."""
     try:
@@ -289,7 +322,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     replay(
         arguments.bag,
         arguments.output,
-        topics=arguments.topic or (),
+        topics=arguments.topic,
         settings=settings,
         weights=arguments.weights,
     )
@@ -310,21 +343,41 @@ def _pack(arguments: argparse.Namespace) -> int:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from relpose_ros.captures.folder import load_capture
-    from relpose_ros.evaluation.protocol import METHODS, evaluate, posed_views, table
+    from relpose_ros.evaluation.protocol import evaluate, table, trust_table
 
-    captures = [posed_views(load_capture(folder)) for folder in arguments.capture]
     rows = evaluate(
-        captures,
+        [sequence for path in arguments.capture for sequence in _posed_views(path, arguments)],
         arguments.views,
         arguments.weights,
-        arguments.method or METHODS,
+        arguments.method,
         arguments.output,
         arguments.seed,
+        variants=arguments.variant,
         orders=arguments.orders,
     )
     print(table(rows))
+    if told := trust_table(rows):
+        print(f"\nWhat estimates said of their own errors, over all captures:\n\n{told}")
     return 0
+
+
+def _posed_views(path: Path, arguments: argparse.Namespace) -> Iterator[PosedViews]:
+    """What is measured on at a place: of a bag each object, else each capture."""
+    from relpose_ros.captures.opening import open_captures
+    from relpose_ros.evaluation.protocol import PosedViews, posed_views
+    from relpose_ros.replay.bags import is_bag
+    from relpose_ros.replay.ground_truth import read_posed_views
+
+    masked = not arguments.no_masks
+    if not is_bag(path):
+        for capture in open_captures(path, arguments.split):
+            yield posed_views(capture, masked=masked)
+        return
+    objects = read_posed_views(path, arguments.topic)
+    for object_id, known in objects.items():
+        name = path.stem if len(objects) == 1 else f"{path.stem}/{object_id}"
+        views, poses = [each.view for each in known], [each.camera_from_world for each in known]
+        yield PosedViews.of_views(name, views, poses, masked=masked)
 
 
 def _render(arguments: argparse.Namespace) -> int:

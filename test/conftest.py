@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import gzip
+import json
 import os
 import random
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 """Material that does not belong in the repository; a fresh clone elsewhere has none."""
@@ -39,3 +45,41 @@ def ros_environment(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.delenv("ROS_STATIC_PEERS", raising=False)
     return dict(os.environ)
+
+
+@pytest.fixture
+def write_category() -> Callable[..., None]:
+    """Writes a tiny category of CO3Dv2: dataset folder, name, names of sequences."""
+    return _write_category
+
+
+def _write_category(root: Path, category: str, sequences: Sequence[str], *, frames: int = 2) -> None:
+    """A category of CO3Dv2 in its published format, with as little in it as will do."""
+    import cv2
+    import numpy as np
+
+    annotations = []
+    (root / category).mkdir(parents=True)
+    for sequence in sequences:
+        for k in range(frames):
+            files = {kind: f"{category}/{sequence}/{kind}s/{k}.png" for kind in ("image", "mask")}
+            for file in files.values():
+                (root / file).parent.mkdir(parents=True, exist_ok=True)
+                cv2.imwrite(str(root / file), np.full((20, 30), 255, np.uint8))
+            viewpoint = {
+                "R": np.eye(3).tolist(), "T": [0.0, 0.0, 2.0 + k], "intrinsics_format": "ndc_isotropic",
+                "focal_length": [2.0, 2.0], "principal_point": [0.0, 0.0],
+            }  # fmt: skip
+            annotations.append(
+                {
+                    "sequence_name": sequence,
+                    "frame_number": k,
+                    "image": {"path": files["image"], "size": [20, 30]},
+                    "mask": {"path": files["mask"]},
+                    "viewpoint": viewpoint,
+                }
+            )
+    listed = [{"sequence_name": sequence, "viewpoint_quality_score": 1.0} for sequence in sequences]
+    for name, content in (("frame", annotations), ("sequence", listed)):
+        with gzip.open(root / category / f"{name}_annotations.jgz", "wt") as stream:
+            json.dump(content, stream)

@@ -13,6 +13,7 @@ from relpose_ros import cli
 from relpose_ros.captures.folder import Frame, save_capture
 from relpose_ros.geometry.cameras import look_at, translation_of
 from relpose_ros.network.checkpoint import random_network, write_network
+from relpose_ros.network.presets import named_preset
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
 COMMANDS = ("node", "replay", "pack", "evaluate", "render", "train", "convert")
@@ -155,5 +156,35 @@ def test_a_capture_becomes_a_bag_an_estimate_and_a_row(tmp_path, posed_capture, 
         cli.main([*evaluate, "--method", "relpose", "--method", "identity", "--weights", str(random_weights)])
         == 0
     )
-    methods = {row["method"] for row in json.loads(rows.read_text())["rows"]}
-    assert methods == {"relpose", "identity"}
+    of_capture = json.loads(rows.read_text())["rows"]
+    assert {row["method"] for row in of_capture} == {"relpose", "identity"}
+
+    # The bag holds the same pictures and poses; the random orders go by the name.
+    evaluate[1] = str(bag.rename(tmp_path / posed_capture.name / "bag"))
+    assert cli.main([*evaluate, "--method", "identity"]) == 0
+    of_bag = json.loads(rows.read_text())["rows"]
+    assert [(row["capture"], row["views"]) for row in of_bag] == [
+        *(("bag", 2), ("bag", 3), ("mean", 2), ("mean", 3))
+    ]
+    whole = ("rotation@median", "center@auc0.4")  # at N = 3 every order holds all three
+    assert [of_bag[1][key] for key in whole] == pytest.approx(
+        [next(r for r in of_capture if (r["method"], r["views"]) == ("identity", 3))[key] for key in whole],
+        abs=1e-4,
+    )
+
+
+def test_variants_masks_and_categories_of_co3d(tmp_path, write_category, capsys):
+    """A network that regresses, beside the others, on a dataset in its published format."""
+    write_category(tmp_path / "co3d", "kite", ["7_8_9"], frames=3)
+    write_category(tmp_path / "co3d", "cup", ["1_2_3"], frames=3)
+    weights, rows = tmp_path / "regression.safetensors", tmp_path / "rows.json"
+    write_network(random_network(named_preset("compact", ["regression"]), 0), weights)
+    command = ["evaluate", str(tmp_path / "co3d"), "--views", "2", "--orders", "1", "--output", str(rows)]
+    command += ["--method", "identity", "--variant", str(weights), "--no-masks"]
+    for split, name in (("held_out", "7_8_9"), ("train", "1_2_3")):
+        assert cli.main([*command, "--split", split]) == 0
+        found = [(row["capture"], row["method"]) for row in json.loads(rows.read_text())["rows"]]
+        assert found[:2] == [(name, "identity"), (name, "regression")]
+    printed = capsys.readouterr().out
+    assert "What estimates said of their own errors" in printed
+    assert len([line for line in printed.splitlines() if line.startswith("mean  ")]) == 6

@@ -45,6 +45,8 @@ TRAINING_CATEGORIES = (
 )
 # fmt: on
 """The other forty-one."""
+FRAME_ANNOTATIONS, SEQUENCE_ANNOTATIONS = "frame_annotations.jgz", "sequence_annotations.jgz"
+"""The files that every category's folder holds."""
 MASK_THRESHOLD = 0.4
 """A pixel belongs to the box from this probability on; the masks are soft."""
 _FLIP = np.array([-1.0, -1.0, 1.0])
@@ -68,8 +70,8 @@ def load_category(
         CaptureError: The category or its annotations are missing or make no sense.
     """
     folder = Path(root) / category
-    sequences = _annotations(folder / "sequence_annotations.jgz")
-    frames = _annotations(folder / "frame_annotations.jgz")
+    sequences = _annotations(folder / SEQUENCE_ANNOTATIONS)
+    frames = _annotations(folder / FRAME_ANNOTATIONS)
     good = {
         entry["sequence_name"]
         for entry in sequences

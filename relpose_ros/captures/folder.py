@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from relpose_ros.estimates import FloatArray
 
+LISTING = "cameras.json"
 CONVENTION = "OpenCV: x right, y down, z forward; camera_from_world"
 ROTATION_TOLERANCE = 1e-3
 """Files hold poses rounded to a few digits: how far R R^T may be from the identity."""
@@ -133,7 +134,7 @@ def load_capture(folder: Path) -> Capture:
         CaptureError: The folder or an entry of its cameras.json is missing or makes no sense.
     """
     folder = Path(folder)
-    listing = folder / "cameras.json"
+    listing = folder / LISTING
     if not folder.is_dir():
         text = f"{folder} is no folder; a capture is a folder with cameras.json and images/."
         raise CaptureError(text)
@@ -178,7 +179,7 @@ def save_capture(folder: Path, frames: Iterable[Frame], *, jpeg_quality: int = 9
     import cv2
 
     folder = Path(folder)
-    listing = folder / "cameras.json"
+    listing = folder / LISTING
     if listing.exists():
         text = f"{folder} holds a capture already; name another folder or remove it."
         raise CaptureError(text)

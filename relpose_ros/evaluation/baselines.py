@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
+    from relpose_ros.estimates import ScanEstimate
     from relpose_ros.inference.estimator import Estimator
     from relpose_ros.views import View
 
@@ -31,6 +32,8 @@ class Poses:
     """(N, 3, 3), nan where the method has no answer."""
     translations: FloatArray
     """(N, 3), nan likewise."""
+    estimate: ScanEstimate | None = None
+    """What else the method says, where it is an estimator."""
 
 
 class Method(Protocol):
@@ -60,7 +63,7 @@ class Estimated:
             estimate = self._estimator.estimate(Scan(object_id="evaluation", views=key))
             rotations = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
             positions = np.stack([camera.position for camera in estimate.cameras])
-            self._last = key, Poses(rotations, translation_of(rotations, positions))
+            self._last = key, Poses(rotations, translation_of(rotations, positions), estimate)
         return self._last[1]
 
 

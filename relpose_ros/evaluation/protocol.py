@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import time
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from relpose_ros.errors import RelPoseError
-from relpose_ros.evaluation import baselines, metrics
+from relpose_ros.evaluation import baselines, metrics, trust
 from relpose_ros.geometry.cameras import camera_centre
+from relpose_ros.inference.estimator import Estimator
 from relpose_ros.inference.evidence import EvidenceSettings
+from relpose_ros.network.presets import variants_of
 from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
 
 if TYPE_CHECKING:
@@ -28,7 +30,8 @@ if TYPE_CHECKING:
     FloatArray = npt.NDArray[np.float64]
 
 Row = dict[str, Any]
-"""One line of the result: capture, method, views, scans, the figures of `metrics.summary`, seconds."""
+"""One line of the result: capture, method, views, scans, the figures of `metrics.summary`, seconds; where the
+method is an estimator, those of `trust.summary` too."""
 
 METHODS = ("relpose", "both", "learned", "geometry", "constant-translation", "identity", "colmap")
 """relpose is the estimator as it ships: the network, matches and refinement. both leaves out the refinement,
@@ -40,6 +43,10 @@ EVIDENCE = {
     "geometry": EvidenceSettings("pairs", learned=False),
 }
 """What the estimator rests on in each of these methods."""
+OF_THE_WEIGHTS = {*EVIDENCE, "constant-translation"}
+"""The methods that ask the network."""
+OF_DISTRIBUTIONS = {"relpose", "both", "geometry"}
+"""The methods that do not differ from learned where the network regresses poses: nothing joins those."""
 ORDERS = 5
 """Random orders a capture, as in the paper."""
 MEAN = "mean"
@@ -70,13 +77,46 @@ class PosedViews:
     view: Callable[[int], View]
     """The k-th view."""
 
+    @classmethod
+    def of_views(
+        cls, name: str, views: Sequence[View], camera_from_world: Sequence[FloatArray], *, masked: bool = True
+    ) -> PosedViews:
+        """Views that are held already, as those of a bag are.
+
+        Args:
+            name: As it stands in a table.
+            views: The M views.
+            camera_from_world: M times (3, 4), any world and unit.
+            masked: Whether the views keep their masks.
+
+        Raises:
+            EvaluationError: There are fewer than two.
+        """
+        if len(views) < MIN_VIEWS:
+            text = f"{name} has {len(views)} views with a pose; measuring needs {MIN_VIEWS} or more."
+            raise EvaluationError(text)
+
+        def view(k: int) -> View:
+            # A view of its own each time, as of a photo that is read again: estimators keep what they know
+            # of a view as long as it lives.
+            return replace(views[k]) if masked else replace(views[k], mask=None)
+
+        return cls(name, np.stack(camera_from_world), view)
+
 
 @dataclass(frozen=True, eq=False)
-class _ScanErrors:
+class _Measured:
+    """One scan."""
+
     rotation: FloatArray
     center: FloatArray
     translation: FloatArray
+    statements: trust.Statements | None
     seconds: float
+
+
+_Scans = dict[tuple[str, int], list[_Measured]]
+"""By method and number of views."""
 
 
 def posed_views(capture: Capture, *, masked: bool = True) -> PosedViews:
@@ -135,10 +175,21 @@ def measure(
         seed: Of the orders.
         on_scan: Called after every estimated scan, for a progress bar.
     """
+    return _rows(sequence.name, _scans(sequence, methods, views, orders, seed, on_scan))
+
+
+def _scans(
+    sequence: PosedViews,
+    methods: Sequence[baselines.Method],
+    views: Sequence[int],
+    orders: int,
+    seed: int,
+    on_scan: Callable[[], object],
+) -> _Scans:
     rotations, translations = sequence.camera_from_world[:, :, :3], sequence.camera_from_world[:, :, 3]
     scale = metrics.scene_scale(camera_centre(rotations, translations))
     depths = [n for n in sorted(set(views)) if n <= len(rotations)]
-    scans: dict[tuple[str, int], list[_ScanErrors]] = {(m.name, n): [] for m in methods for n in depths}
+    scans: _Scans = {(m.name, n): [] for m in methods for n in depths}
     for order in view_orders(sequence.name, len(rotations), max(depths, default=0), orders=orders, seed=seed):
         held = [sequence.view(k) for k in order]
         for n in depths:
@@ -146,18 +197,25 @@ def measure(
             for method in methods:
                 started = time.perf_counter()
                 poses = method.poses(held[:n])
+                seconds = time.perf_counter() - started
+                estimate = poses.estimate
                 scans[method.name, n].append(
-                    _ScanErrors(
+                    _Measured(
                         metrics.rotation_errors(poses.rotations, true_r),
                         metrics.center_errors(poses.rotations, poses.translations, true_r, true_t, scale),
                         metrics.translation_errors(poses.rotations, poses.translations, true_t, scale),
-                        time.perf_counter() - started,
+                        None if estimate is None else trust.statements(estimate, true_r, true_t),
+                        seconds,
                     )
                 )
                 on_scan()
+    return scans
+
+
+def _rows(capture: str, scans: _Scans) -> list[Row]:
     return [
         {
-            "capture": sequence.name,
+            "capture": capture,
             "method": name,
             "views": n,
             "scans": len(group),
@@ -167,9 +225,15 @@ def measure(
                 np.concatenate([scan.translation for scan in group]),
             ),
             "seconds": float(np.mean([scan.seconds for scan in group])),
+            **_trust(group),
         }
         for (name, n), group in scans.items()
     ]
+
+
+def _trust(group: Sequence[_Measured]) -> dict[str, float]:
+    said = [scan.statements for scan in group if scan.statements is not None]
+    return trust.summary(said) if said else {}
 
 
 def mean_rows(rows: Iterable[Row]) -> list[Row]:
@@ -210,33 +274,46 @@ def table(rows: Sequence[Row], columns: Sequence[str] = SHOWN) -> str:
     )
 
 
+def trust_table(rows: Sequence[Row]) -> str:
+    """As `table`: how far what estimators say of their own errors holds; empty without estimators."""
+    estimated = [row for row in rows if row["capture"] == MEAN and trust.SHOWN[0] in row]
+    return table(estimated, trust.SHOWN) if estimated else ""
+
+
 def evaluate(
     sequences: Sequence[PosedViews],
     views: Sequence[int] = range(MIN_VIEWS, MAX_VIEWS + 1),
     weights: Path | None = None,
-    methods: Sequence[str] = METHODS,
+    methods: Sequence[str] | None = None,
     output: Path | None = None,
     seed: int = 0,
     *,
+    variants: Sequence[Path] = (),
     orders: int = ORDERS,
     threads: int | None = None,
     progress: bool = True,
 ) -> list[Row]:
     """Measure methods on captures; the rows of each capture, then their mean.
 
+    In the mean every capture counts the same; but what estimates say of their errors is held against all
+    scans together, since few of them say little of a probability.
+
     Args:
         sequences: From `posed_views`, or made of a bag's views.
         views: Numbers of views, each 2 to 8.
         weights: Network file; None for the shipped weights.
-        methods: Among `METHODS`.
+        methods: Among `METHODS`; None for all that differ from each other with these weights.
         output: Where to write ``{"rows": [...]}`` as JSON, or None.
         seed: Of the orders.
+        variants: Network files of variants of the paper, each measured alone in rows that bear its name.
         orders: Random orders a capture.
         threads: Of the network; None for torch's own choice.
         progress: Whether to show a progress bar on stderr.
 
     Raises:
-        EvaluationError: No captures, a number of views outside 2 to 8, or an unknown method.
+        EvaluationError: No captures, a number of views outside 2 to 8, an unknown method, or a file that
+            holds no variant or one that was named before.
+        NetworkFileError: Weights cannot be loaded.
     """
     from tqdm import tqdm
 
@@ -246,34 +323,41 @@ def evaluate(
     if not views or min(views) < MIN_VIEWS or max(views) > MAX_VIEWS:
         text = f"numbers of views are {list(views)}; each must lie between {MIN_VIEWS} and {MAX_VIEWS}."
         raise EvaluationError(text)
-    chosen = _methods(methods, weights, seed, threads)
+    chosen = _methods(methods, weights, seed, threads) + _variants(variants, threads)
     rows: list[Row] = []
+    everywhere: _Scans = {}
     total = orders * len(chosen) * sum(n <= len(s.camera_from_world) for n in set(views) for s in sequences)
     with tqdm(total=total, unit="scan", disable=not progress) as bar:
         for sequence in sequences:
             bar.set_postfix_str(sequence.name)
-            rows += measure(sequence, chosen, views, orders=orders, seed=seed, on_scan=bar.update)
-    rows += mean_rows(rows)
+            scans = _scans(sequence, chosen, views, orders, seed, bar.update)
+            rows += _rows(sequence.name, scans)
+            for key, group in scans.items():
+                everywhere.setdefault(key, []).extend(group)
+    rows += [{**row, **_trust(everywhere[row["method"], row["views"]])} for row in mean_rows(rows)]
     if output is not None:
         output.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
     return rows
 
 
 def _methods(
-    names: Sequence[str], weights: Path | None, seed: int, threads: int | None
+    names: Sequence[str] | None, weights: Path | None, seed: int, threads: int | None
 ) -> list[baselines.Method]:
-    if unknown := [name for name in names if name not in METHODS]:
+    if unknown := [name for name in names or () if name not in METHODS]:
         text = f"{unknown[0]!r} is no method; choose among {', '.join(METHODS)}."
         raise EvaluationError(text)
-    chosen: list[baselines.Method] = []
     estimating: dict[str, baselines.Estimated] = {}
-    for name in names:
-        of = "learned" if name == "constant-translation" else name
-        if of in EVIDENCE and of not in estimating:
-            from relpose_ros.inference.estimator import Estimator
-
-            estimator = Estimator.from_weights(weights, threads, EVIDENCE[of])
-            estimating[of] = baselines.Estimated(of, estimator)
+    if names is None or OF_THE_WEIGHTS.intersection(names):
+        estimator = Estimator.from_weights(weights, threads)
+        estimating = {
+            name: baselines.Estimated(name, estimator.resting_on(evidence))
+            for name, evidence in EVIDENCE.items()
+        }
+        if names is None:
+            regresses = estimator.preset.rotation == "regression"
+            names = [name for name in METHODS if not (regresses and name in OF_DISTRIBUTIONS)]
+    chosen: list[baselines.Method] = []
+    for name in names or ():
         if name in EVIDENCE:
             chosen.append(estimating[name])
         elif name == "constant-translation":
@@ -283,3 +367,18 @@ def _methods(
         elif name == "colmap":
             chosen.append(baselines.Colmap(seed))
     return chosen
+
+
+def _variants(files: Sequence[Path], threads: int | None) -> list[baselines.Method]:
+    chosen: dict[str, baselines.Method] = {}
+    for file in files:
+        estimator = Estimator.from_weights(file, threads, EVIDENCE["learned"])
+        name = "+".join(variants_of(estimator.preset))
+        if not name:
+            of = estimator.preset.name
+            text = f"{file} holds the network {of!r} and no variant of it: name it as weights."
+            raise EvaluationError(text)
+        if name in chosen:
+            raise EvaluationError(f"{file} holds another {name}; of each variant one file can be measured.")
+        chosen[name] = baselines.Estimated(name, estimator)
+    return list(chosen.values())

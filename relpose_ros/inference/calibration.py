@@ -184,9 +184,9 @@ def measure_calibration(observations: Sequence[Observation], calibration: Calibr
         pairs=len(stated),
         log_likelihood=log_likelihood(observations, calibration.temperature, calibration.flat),
         expected_calibration_error=expected_calibration_error(np.array(stated), np.array(right)),
-        pair_coverage=_coverage(pair_squares),
-        camera_rotation_coverage=_coverage(rotation_squares),
-        camera_position_coverage=_coverage(position_squares),
+        pair_coverage=coverage(pair_squares),
+        camera_rotation_coverage=coverage(rotation_squares),
+        camera_position_coverage=coverage(position_squares),
     )
 
 
@@ -221,7 +221,9 @@ def _mahalanobis_squares(
     for observation in observations:
         for pair in _pairs(observation, calibration):
             truth = _true_relative(observation, pair.i, pair.j)
-            of_pairs.append(_square(so3.log(truth @ pair.camera_j_from_camera_i.T), pair.covariance))
+            of_pairs.append(
+                mahalanobis_square(so3.log(truth @ pair.camera_j_from_camera_i.T), pair.covariance)
+            )
         with torch.no_grad():
             covariances = camera_covariances(
                 observation.distributions,
@@ -235,17 +237,19 @@ def _mahalanobis_squares(
         true_centres = cameras.camera_centre(observation.true_rotations, observation.true_translations)
         for camera in range(1, len(rotations)):
             turn = so3.log(observation.true_rotations[camera].T @ rotations[camera])  # axes of the object
-            of_rotations.append(_square(turn, covariances[camera, 3:, 3:]))
+            of_rotations.append(mahalanobis_square(turn, covariances[camera, 3:, 3:]))
             shift = true_centres[camera] - centres[camera]
-            of_positions.append(_square(shift, covariances[camera, :3, :3]))
+            of_positions.append(mahalanobis_square(shift, covariances[camera, :3, :3]))
     return np.array(of_pairs), np.array(of_rotations), np.array(of_positions)
 
 
-def _square(error: FloatArray, covariance: FloatArray) -> float:
+def mahalanobis_square(error: FloatArray, covariance: FloatArray) -> float:
+    """Squared length of an error in units of its covariance. (3,), (3, 3)."""
     return float(error @ np.linalg.solve(covariance, error))
 
 
-def _coverage(squares: FloatArray) -> tuple[float, ...]:
+def coverage(squares: FloatArray) -> tuple[float, ...]:
+    """Shares of errors inside the ellipsoids of `LEVELS`, by `mahalanobis_square`. (K,) -> one a level."""
     return tuple(float((squares <= quantile).mean()) for quantile in CHI_SQUARE_3)
 
 
@@ -255,7 +259,7 @@ def _spread(squares: FloatArray) -> float:
     def miss(coverage: tuple[float, ...]) -> float:
         return sum(abs(got - wanted) for got, wanted in zip(coverage, LEVELS, strict=True))
 
-    return factor if miss(_coverage(squares / factor)) < miss(_coverage(squares)) else 1.0
+    return factor if miss(coverage(squares / factor)) < miss(coverage(squares)) else 1.0
 
 
 def _translation_sigma(observations: Sequence[Observation]) -> tuple[float, float, float]:

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from relpose_ros.inference.matches import TwoViewGeometry
     from relpose_ros.inference.pair_distribution import PairDistributions
     from relpose_ros.network.features import SceneFeatures
+    from relpose_ros.network.presets import Preset
     from relpose_ros.network.relpose import RelPose
     from relpose_ros.views import Scan, View
 
@@ -153,6 +154,15 @@ class Estimator:
         network = load_network(path)
         stored = read_metadata(path).get("calibration")
         return cls(network, Calibration.from_json(stored) if stored else None, evidence)
+
+    @property
+    def preset(self) -> Preset:
+        """Of its network."""
+        return self._network.preset
+
+    def resting_on(self, evidence: EvidenceSettings) -> Estimator:
+        """An estimator of the same weights and calibration with other evidence; they share nothing else."""
+        return Estimator(self._network, self._calibration, evidence)
 
     def rest_on(self, evidence: EvidenceSettings) -> None:
         """Goes on with other evidence from the next estimate on."""

@@ -151,3 +151,12 @@ def named_preset(name: str, variants: Sequence[str] = ()) -> Preset:
             raise PresetError(f"There is no variant '{variant}'; choose among {', '.join(VARIANTS)}.")
         preset = replace(preset, **VARIANTS[variant])
     return preset
+
+
+def variants_of(preset: Preset) -> tuple[str, ...]:
+    """The variants that were made of a preset, in the order of `VARIANTS`."""
+    return tuple(
+        name
+        for name, changes in VARIANTS.items()
+        if all(getattr(preset, field) == value for field, value in changes.items())
+    )

@@ -375,6 +375,13 @@ class Input:
     """What pairs an image with its camera info: the image topic without its transport."""
 
 
+def is_bag(path: Path) -> bool:
+    """Whether a path is meant as a bag: any file, or a folder with recorded files or their metadata."""
+    if not path.is_dir():
+        return path.is_file()
+    return (path / "metadata.yaml").exists() or any(_storage_suffix(each) for each in path.iterdir())
+
+
 def choose_inputs(bag: BagReader, wanted: Sequence[str] = ()) -> dict[str, Input]:
     """Which topics of a bag feed the scanner, and as what.
 

@@ -17,6 +17,7 @@ from relpose_ros.replay.bags import (
     BagError,
     BagWriter,
 )
+from relpose_ros.replay.ground_truth import GROUND_TRUTH_TOPIC
 from relpose_ros.scanning.image_decoding import ImageError, compressed_format, decode_compressed
 
 if TYPE_CHECKING:
@@ -30,7 +31,6 @@ Form = Literal["image", "object_view"]
 IMAGE_TOPIC = "/image/compressed"
 CAMERA_INFO_TOPIC = "/camera_info"
 OBJECT_VIEW_TOPIC = "/object_view"
-GROUND_TRUTH_TOPIC = "/ground_truth/pose"
 CAMERA_FRAME = "camera_optical_frame"
 WORLD_FRAME = "capture_world"
 START_NS = 1_000_000_000
@@ -82,12 +82,12 @@ def pack(
         else:
             bag.add_topic(OBJECT_VIEW_TOPIC, OBJECT_VIEW)
         if posed:
-            bag.add_topic(GROUND_TRUTH_TOPIC, POSE_STAMPED)
+            bag.add_topic(f"/{GROUND_TRUTH_TOPIC}", POSE_STAMPED)
         for k, photo in enumerate(photos):
             stamp_ns = START_NS + round(k * period_s * 1e9)
             make = _Messages(bag.types, stamp_ns)
             if photo.camera_from_world is not None:
-                bag.write(GROUND_TRUTH_TOPIC, stamp_ns, make.pose(photo))
+                bag.write(f"/{GROUND_TRUTH_TOPIC}", stamp_ns, make.pose(photo))
             if form == "image":
                 bag.write(CAMERA_INFO_TOPIC, stamp_ns, make.camera_info(photo))
                 bag.write(IMAGE_TOPIC, stamp_ns, make.compressed(photo))

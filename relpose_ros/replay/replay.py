@@ -18,8 +18,8 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from relpose_ros.errors import RelPoseError
 from relpose_ros.geometry import so3
-from relpose_ros.replay.bags import POSE_STAMPED, BagReader, BagWriter, choose_inputs
-from relpose_ros.replay.comparison import TruePose
+from relpose_ros.replay.bags import BagReader, BagWriter, choose_inputs
+from relpose_ros.replay.ground_truth import of_one_camera, read_true_poses
 from relpose_ros.replay.recording import Recording
 from relpose_ros.replay.report import Cells, write_report
 from relpose_ros.scanning.outgoing import estimate_message, markers, pose_array
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from relpose_ros.estimates import CameraPose, FloatArray, Mode, PairRotation
+    from relpose_ros.replay.comparison import TruePose
     from relpose_ros.replay.recording import EstimateRecord, ViewRecord
     from relpose_ros.scanning.scanner import SupportsEstimate
     from relpose_ros.views import Scan
@@ -40,7 +41,6 @@ ESTIMATE_TOPIC = "/scan_node/estimate"
 POSES_TOPIC = "/scan_node/poses"
 MARKERS_TOPIC = "/scan_node/markers"
 """The node's own names, so that a layout made for the node shows a replay too."""
-GROUND_TRUTH_TOPIC = "ground_truth/pose"
 
 ESTIMATES_FOLDER, SCAN_FILE, REPORT_FILE = "estimates", "scan.json", "report.html"
 SHOWN_REASONS = 6
@@ -91,7 +91,7 @@ def replay(
     _check_replaceable(output)
     with BagReader(bag) as reader:
         inputs = choose_inputs(reader, topics)
-        truth = _ground_truth(reader)
+        truth = read_true_poses(reader)
         _check_writable(output)  # before the long part
         if estimator is None:
             estimator = _learned_estimator(weights, settings)
@@ -131,7 +131,7 @@ def replay(
     with _written_whole(output) as folder:
         for name, recording in _folders(recordings).items():
             cells = _cells(estimator, recording)
-            known = _truth_of(recording, truth)
+            known = of_one_camera(truth, (each.view.stamp_ns for each in recording.views))
             _write(folder / name, recording, settings, known, rejected, bag.name, cells)
     for name, recording in _folders(recordings).items():
         last = recording.estimates[-1].estimate
@@ -159,47 +159,6 @@ def _cells(
     pairs = recording.estimates[-1].estimate.pairs
     masses = estimator.pair_masses(recording.newest_scan)
     return {(pair.i, pair.j): Cells(*each) for pair, each in zip(pairs, masses, strict=True)}
-
-
-def _ground_truth(reader: BagReader) -> dict[int, TruePose]:
-    """True camera poses by stamp, from every PoseStamped topic called ground_truth/pose.
-
-    Stamps with two poses, of cameras that are triggered together, are left out: a pose names no camera.
-    """
-    topics = [
-        topic
-        for topic, kind in reader.topics.items()
-        if kind == POSE_STAMPED and f"/{topic}".endswith(f"/{GROUND_TRUTH_TOPIC}")
-    ]
-    truth: dict[int, TruePose] = {}
-    shared: set[int] = set()
-    for record in reader.records(topics):
-        stamp, pose = record.message.header.stamp, record.message.pose
-        q, p = pose.orientation, pose.position
-        quaternion, centre = np.array([q.x, q.y, q.z, q.w]), np.array([p.x, p.y, p.z])
-        stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
-        if not np.isfinite(centre).all() or not 0.99 < np.linalg.norm(quaternion) < 1.01:
-            logger.warning(
-                "The true pose on %s with stamp %d ns is no pose; it is left out.", record.topic, stamp_ns
-            )
-            continue
-        pose = TruePose(so3.from_quaternion_xyzw(quaternion), centre)
-        if not _same(truth.setdefault(stamp_ns, pose), pose):
-            shared.add(stamp_ns)
-    if shared:
-        logger.warning("%d stamps have several true poses; those are left out.", len(shared))
-    return {stamp_ns: pose for stamp_ns, pose in truth.items() if stamp_ns not in shared}
-
-
-def _same(one: TruePose, other: TruePose) -> bool:
-    turns = np.array_equal(one.world_from_camera, other.world_from_camera)
-    return turns and np.array_equal(one.centre, other.centre)
-
-
-def _truth_of(recording: Recording, truth: Mapping[int, TruePose]) -> dict[int, TruePose]:
-    """The true poses, without those whose stamp several views have: it is one camera's."""
-    views = Counter(record.view.stamp_ns for record in recording.views)
-    return {stamp_ns: pose for stamp_ns, pose in truth.items() if views[stamp_ns] <= 1}
 
 
 def _why_nothing(bag: Path, scanner: Scanner, rejected: Sequence[tuple[str, int]]) -> str:

@@ -1,17 +1,21 @@
 """The protocol: the same orders for everybody, prefixes of each other; a perfect method scores perfectly."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from relpose_ros.captures.folder import Frame, save_capture
 from relpose_ros.evaluation import protocol
-from relpose_ros.evaluation.baselines import ConstantTranslation, Identity, Poses
+from relpose_ros.evaluation.baselines import ConstantTranslation, Estimated, Identity, Poses
+from relpose_ros.evaluation.metrics import rotation_errors
 from relpose_ros.evaluation.protocol import EvaluationError, PosedViews
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import look_at, translation_of
+from relpose_ros.inference.estimator import Estimator
+from relpose_ros.network.checkpoint import random_network, write_network
+from relpose_ros.network.presets import named_preset
 from relpose_ros.views import BoundingBox, View
 
 
@@ -117,6 +121,78 @@ def test_wrong_questions_are_answered_with_a_sentence():
         protocol.evaluate([posed()], [1, 2], methods=["identity"], progress=False)
     with pytest.raises(EvaluationError, match="magic"):
         protocol.evaluate([posed()], [2], methods=["magic"], progress=False)
+
+
+@pytest.fixture
+def weights(tmp_path):
+    """Writes a network of random weights and names the file."""
+
+    def write(*variants):
+        file = tmp_path / f"{'_'.join(variants) or 'plain'}.safetensors"
+        write_network(random_network(named_preset("compact", variants), 0), file)
+        return file
+
+    return write
+
+
+def test_variants_of_the_paper_are_rows_beside_the_methods(weights):
+    sequence = posed(3)
+    files = [weights("regression"), weights("regression", "first-camera"), weights("no-index")]
+    rows = protocol.evaluate([sequence], [3], methods=["identity"], variants=files, orders=1, progress=False)
+    rows = {row["method"]: row for row in rows if row["capture"] == "thing"}
+    assert list(rows) == ["identity", "regression", "regression+first-camera", "no-index"]
+    views = [sequence.view(k) for (order,) in [protocol.view_orders("thing", 3, 3, orders=1)] for k in order]
+    alone = Estimated("regression", Estimator.from_weights(files[0])).poses(views)
+    true = sequence.camera_from_world[protocol.view_orders("thing", 3, 3, orders=1)[0], :, :3]
+    errors = rotation_errors(alone.rotations, true)
+    assert rows["regression"]["rotation@median"] == pytest.approx(np.median(errors))
+    assert rows["regression"]["rotation@median"] != rows["no-index"]["rotation@median"]
+    assert rows["regression"]["enough"] == 0
+    assert rows["regression"]["stated@15"] < 0.001
+    assert "enough" not in rows["identity"]
+
+
+def test_what_is_no_variant_or_one_twice_is_refused(weights):
+    with pytest.raises(
+        EvaluationError, match=r"plain\.safetensors holds the network 'compact' and no variant"
+    ):
+        protocol.evaluate([posed()], [2], methods=[], variants=[weights()], progress=False)
+    with pytest.raises(EvaluationError, match="holds another pair-context"):
+        protocol.evaluate([posed()], [2], methods=[], variants=[weights("pair-context")] * 2, progress=False)
+
+
+def test_weights_that_regress_are_measured_by_the_methods_that_differ(weights):
+    sequence = posed(3)
+    pytest.importorskip("pycolmap")
+    rows = protocol.evaluate([sequence], [2], weights("regression"), orders=1, progress=False)
+    methods = [row["method"] for row in rows if row["capture"] == "thing"]
+    assert methods == ["learned", "constant-translation", "identity", "colmap"]
+
+
+def test_in_the_mean_statements_are_held_against_all_scans_together(weights):
+    """Of one pair a probability can only be far from a frequency; of all pairs it need not be."""
+    sequences = [posed(4, seed=seed, name=str(seed)) for seed in range(4)]
+    file = weights("first-camera")
+    rows = protocol.evaluate(sequences, [2], file, ["learned"], orders=1, progress=False)
+    errors = [row["calibration_error@15"] for row in rows]
+    assert rows[-1]["stated@15"] == pytest.approx(np.mean([row["stated@15"] for row in rows[:-1]]))
+    assert errors[-1] <= np.mean(errors[:-1]) + 1e-12
+    lines = protocol.trust_table(rows).splitlines()
+    assert [line.split()[0] for line in lines] == ["capture", "mean"]
+    assert protocol.trust_table([{"capture": "mean", "method": "identity"}]) == ""
+
+
+def test_views_that_are_held_are_read_anew_each_time():
+    """An estimator would know a view that it met in an earlier order: not so a photo that is read again."""
+    given = posed(3)
+    views = [replace(given.view(k), mask=np.ones((8, 8), bool)) for k in range(3)]
+    sequence = PosedViews.of_views("cup", views, list(given.camera_from_world))
+    assert sequence.view(1) is not sequence.view(1)
+    assert sequence.view(1).image is views[1].image
+    assert sequence.view(1).mask is views[1].mask
+    assert PosedViews.of_views("cup", views, list(given.camera_from_world), masked=False).view(1).mask is None
+    with pytest.raises(EvaluationError, match="cup has 1 views with a pose"):
+        PosedViews.of_views("cup", views[:1], list(given.camera_from_world[:1]))
 
 
 def test_only_photos_with_a_pose_are_measured_on(tmp_path):

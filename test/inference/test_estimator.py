@@ -125,6 +125,16 @@ def test_each_view_is_looked_at_once_and_forgotten_with_the_view(network, monkey
     assert len(estimator._looks) == 0
 
 
+def test_other_evidence_on_the_same_weights(network):
+    given = Estimator(network, CALIBRATED)
+    alone = given.resting_on(EvidenceSettings("network"))
+    assert numbers(alone.estimate(scan(0, 1))) == numbers(
+        Estimator(network, CALIBRATED, EvidenceSettings("network")).estimate(scan(0, 1))
+    )
+    assert alone.preset is network.preset
+    assert len(given._looks) == 0
+
+
 @pytest.mark.parametrize("count", [0, 1, 9])
 def test_refuses_what_no_estimate_can_be_made_of(network, count):
     with pytest.raises(ScanError, match=f"'mug' has {count} views; an estimate takes 2 to 8"):

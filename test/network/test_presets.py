@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from relpose_ros.network.presets import PRESETS, VARIANTS, PresetError, named_preset
+from relpose_ros.network.presets import PRESETS, VARIANTS, PresetError, named_preset, variants_of
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -20,6 +20,14 @@ def test_presets_and_their_variants_are_found_by_name(name: str) -> None:
     both = named_preset(name, ["first-camera", "regression"])
     assert (both.rotation, both.translation_frame) == ("regression", "first_camera")
     assert both == named_preset(name, ["regression", "first-camera"])
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_tells_its_variants(name: str) -> None:
+    assert variants_of(PRESETS[name]) == ()
+    for variant in VARIANTS:
+        assert variants_of(named_preset(name, [variant])) == (variant,)
+    assert variants_of(named_preset(name, ["first-camera", "regression"])) == ("regression", "first-camera")
 
 
 def test_what_there_is_not_is_refused_with_what_there_is() -> None:

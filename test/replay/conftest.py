@@ -12,12 +12,15 @@ from relpose_ros.captures.folder import Frame, save_capture
 from relpose_ros.estimates import CameraPose, Evidence, Mode, PairRotation, ScanEstimate, Verdict
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import look_at, translation_of
+from relpose_ros.replay.bags import BagReader, BagWriter
 from relpose_ros.replay.comparison import TruePose
 from relpose_ros.views import BoundingBox, Intrinsics, Scan, View
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
+
+    from relpose_ros.replay.bags import Record
 
 SIDE = 48
 
@@ -115,3 +118,19 @@ def write_posed_capture() -> Callable[..., list[TruePose]]:
 @pytest.fixture
 def capture(tmp_path: Path) -> tuple[Path, list[TruePose]]:
     return tmp_path / "cup", write_capture(tmp_path / "cup", 5)
+
+
+@pytest.fixture
+def rewrite() -> Callable[[Path, Path, Callable[[Record], Iterable[Record]]], Path]:
+    """Writes a copy of a bag with each message changed, left out or repeated, and returns its path."""
+
+    def written(source: Path, target: Path, change: Callable[[Record], Iterable[Record]]) -> Path:
+        with BagReader(source) as bag, BagWriter(target) as writer:
+            changed = [new for record in bag.records(bag.topics) for new in change(record)]
+            for record in {record.topic: record for record in changed}.values():
+                writer.add_topic(record.topic, record.message.__msgtype__)
+            for record in changed:
+                writer.write(record.topic, record.log_time_ns, record.message)
+        return target
+
+    return written

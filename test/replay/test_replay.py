@@ -13,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from relpose_ros.geometry import so3
 from relpose_ros.replay import bags
-from relpose_ros.replay.bags import BagError, BagReader, BagWriter
+from relpose_ros.replay.bags import BagError, BagReader
 from relpose_ros.replay.pack import pack
 from relpose_ros.replay.replay import ReplayError, replay
 from relpose_ros.scanning.settings import ScanSettings
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     Fake = Callable[..., Any]
     Capture = tuple[Path, list[TruePose]]
+    Rewrite = Callable[[Path, Path, Callable[[Record], Iterable[Record]]], Path]
 
 OUTPUTS = {"estimates", "scan.json", "report.html"}
 
@@ -41,17 +42,6 @@ def contents(folder: Path) -> dict[str, bytes]:
 def records(path: Path) -> list[Record]:
     with BagReader(path) as bag:
         return list(bag.records(bag.topics))
-
-
-def rewrite(source: Path, target: Path, change: Callable[[Record], Iterable[Record]]) -> None:
-    """A copy of a bag with each message changed, left out or repeated."""
-    with BagReader(source) as bag, BagWriter(target) as writer:
-        changed = [new for record in bag.records(bag.topics) for new in change(record)]
-        topics = dict.fromkeys(record.topic for record in changed)
-        for topic in topics:
-            writer.add_topic(topic, next(r.message.__msgtype__ for r in changed if r.topic == topic))
-        for record in changed:
-            writer.write(record.topic, record.log_time_ns, record.message)
 
 
 @pytest.mark.parametrize("form", ["image", "object_view"])
@@ -163,7 +153,9 @@ def test_every_kind_of_bag_gives_the_same_answer(
     assert contents(tmp_path / "out") == contents(tmp_path / "wanted")
 
 
-def test_every_object_has_its_own_folder(tmp_path: Path, capture: Capture, fake_estimator: Fake) -> None:
+def test_every_object_has_its_own_folder(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, rewrite: Rewrite
+) -> None:
     folder, truth = capture
     pack(folder, tmp_path / "cup_bag", form="object_view")
 
@@ -190,7 +182,7 @@ def test_every_object_has_its_own_folder(tmp_path: Path, capture: Capture, fake_
 
 
 def test_an_object_that_made_room_for_another_keeps_its_output(
-    tmp_path: Path, capture: Capture, fake_estimator: Fake
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, rewrite: Rewrite
 ) -> None:
     folder, truth = capture
     pack(folder, tmp_path / "one", form="object_view")
@@ -221,7 +213,7 @@ def test_views_that_make_way_are_numbered_once(
 
 
 def test_rejected_messages_are_counted_by_their_reason(
-    tmp_path: Path, capture: Capture, fake_estimator: Fake, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, caplog: pytest.LogCaptureFixture, rewrite: Rewrite
 ) -> None:
     folder, truth = capture
     pack(folder, tmp_path / "good")
@@ -241,7 +233,7 @@ def test_rejected_messages_are_counted_by_their_reason(
 
 
 def test_no_estimate_is_an_error_that_says_why(
-    tmp_path: Path, capture: Capture, fake_estimator: Fake
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, rewrite: Rewrite
 ) -> None:
     folder, truth = capture
     pack(folder, tmp_path / "one", views=[0])
@@ -306,7 +298,7 @@ def test_only_an_earlier_replay_is_replaced(tmp_path: Path, capture: Capture, fa
 
 
 def test_a_true_pose_that_is_none_is_left_out(
-    tmp_path: Path, capture: Capture, fake_estimator: Fake, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, caplog: pytest.LogCaptureFixture, rewrite: Rewrite
 ) -> None:
     folder, truth = capture
     pack(folder, tmp_path / "good")
@@ -325,7 +317,7 @@ def test_a_true_pose_that_is_none_is_left_out(
 
 @pytest.mark.parametrize("truth_of_both", [False, True])
 def test_cameras_that_are_triggered_together_give_a_view_each(
-    tmp_path: Path, capture: Capture, fake_estimator: Fake, truth_of_both: bool
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, truth_of_both: bool, rewrite: Rewrite
 ) -> None:
     folder, truth = capture
     pack(folder, tmp_path / "one")
