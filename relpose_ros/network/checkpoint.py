@@ -181,9 +181,8 @@ def _existing(path: Path | str | None) -> Path:
 
 
 def _read(file: Path) -> tuple[Tensors, dict[str, str]]:
-    if _is_safetensors(file):
-        return _read_safetensors(file)
-    return _read_checkpoint(file), {}
+    state, metadata = _read_safetensors(file) if _is_safetensors(file) else (_read_checkpoint(file), {})
+    return _without_prefix(state, file), metadata
 
 
 def _is_safetensors(file: Path) -> bool:
@@ -277,7 +276,12 @@ def _state_dict(content: Any, file: Path) -> Tensors:
         raise NetworkFileError(
             f"The weights file '{file}' has no state dict but {names or 'nothing'}; expected {_EXPECTED}."
         )
-    bare = [str(name).removeprefix("module.") for name in state]
+    return {str(name): tensor for name, tensor in state.items()}
+
+
+def _without_prefix(state: Tensors, file: Path) -> Tensors:
+    """Names as they were before a trainer's wrapper put "module." before each."""
+    bare = [name.removeprefix("module.") for name in state]
     if twice := [name for name, times in Counter(bare).items() if times > 1]:
         raise NetworkFileError(
             f"The weights file '{file}' holds with and without 'module.' before the name {_listed(twice)}; "

@@ -85,6 +85,46 @@ def test_a_bare_state_dict_and_foreign_safetensors_load_too(compact: RelPose, tm
         assert same_weights(checkpoint.load_network(tmp_path / name), compact)
 
 
+def test_the_prefix_is_taken_off_in_safetensors_too(compact: RelPose, tmp_path: Path) -> None:
+    import safetensors.torch
+
+    prefixed = {f"module.{name}": tensor for name, tensor in compact.state_dict().items()}
+    metadata = {"preset": "compact", "digest": checkpoint.digest(prefixed)}
+    safetensors.torch.save_file(prefixed, tmp_path / "prefixed.safetensors", metadata)
+    assert same_weights(checkpoint.load_network(tmp_path / "prefixed.safetensors"), compact)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_a_checkpoint_of_another_precision_is_brought_to_single(
+    compact: RelPose, tmp_path: Path, dtype: torch.dtype
+) -> None:
+    stored = {name: tensor.to(dtype) for name, tensor in compact.state_dict().items()}
+    torch.save({"state_dict": stored}, tmp_path / "ckpt.pth")
+    loaded = checkpoint.load_network(tmp_path / "ckpt.pth").state_dict()
+    assert all(tensor.dtype == torch.float32 for tensor in loaded.values())
+    assert all(torch.equal(loaded[name], tensor.float()) for name, tensor in stored.items())
+
+
+def test_the_format_before_archives_loads_and_is_refused_where_it_ends_early(
+    compact: RelPose, tmp_path: Path
+) -> None:
+    file = tmp_path / "ckpt.pth"
+    torch.save({"state_dict": compact.state_dict()}, file, _use_new_zipfile_serialization=False)
+    assert same_weights(checkpoint.load_network(file), compact)
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    assert "damaged or truncated" in refusal(file)
+
+
+def test_metadata_of_another_preset_is_refused_with_the_names(compact: RelPose, tmp_path: Path) -> None:
+    import safetensors.torch
+
+    file = tmp_path / "weights.safetensors"
+    safetensors.torch.save_file(compact.state_dict(), file, {"preset": "paper"})
+    text = refusal(file)
+    assert "does not fit the 'paper' network: it lacks feature_extractor." in text
+    assert "embedding (1, 1, 4) instead of (1, 1, 8)" in text
+
+
 def test_an_index_table_that_is_missing_or_longer_is_rebuilt(compact: RelPose, tmp_path: Path) -> None:
     longer = torch.full((1, 20, 256), 7.0)
     for change in (None, longer):

@@ -75,6 +75,82 @@ def test_crop_parameters_by_hand() -> None:
     assert crops.crop_parameters(0, 0, 100, 100, 100).tolist() == [0, 0, 2]
 
 
+def by_the_description(view: View, size: int) -> tuple[np.ndarray, list[float]] | None:
+    """Crop (S, S, 3) in 0..255 and crop parameters as the method is described, with nothing of ours.
+
+    The box made square on its longer side, scaled by 1.15 about its centre, integer corners, black outside
+    (white beside a mask), bilinear. None for a square that shows nothing of the picture.
+    """
+    corners = np.array([[view.box.x0, view.box.y0], [view.box.x1, view.box.y1]])
+    centre, half = corners.mean(0), (corners[1] - corners[0]).max() / 2 * 1.15
+    first = np.round(centre - half).astype(int)
+    last = first + np.round(2 * half).astype(int)
+    x, y = (np.arange(first[axis], last[axis]) - view.origin[axis] for axis in (0, 1))
+    height, width = view.image.shape[:2]
+    known = ((y >= 0) & (y < height))[:, None] & ((x >= 0) & (x < width))
+    if not known.any():
+        return None
+    rows, columns = np.clip(y, 0, height - 1)[:, None], np.clip(x, 0, width - 1)
+    if view.mask is not None:
+        known &= view.mask[rows, columns]
+    outside = 0.0 if view.mask is None else 255.0
+    crop = np.where(known[..., None], view.image[rows, columns].astype(float), outside)
+    shorter = min(view.full_width, view.full_height)
+    (cx, cy), side = (first + last) / 2, last[0] - first[0]
+    parameters = [-(2 * cx / shorter - 1), -(2 * cy / shorter - 1), 2 * side / shorter]
+    return resized(crop, size), parameters
+
+
+odd_boxes = st.tuples(st.floats(-90, 230), st.floats(-90, 180), st.floats(0.5, 300), st.floats(0.5, 300)).map(
+    lambda b: BoundingBox(b[0], b[1], b[0] + b[2], b[1] + b[3])
+)
+
+
+@settings(max_examples=150)
+@given(
+    odd_boxes
+    | odd_boxes.map(lambda b: BoundingBox(*(float(round(e)) for e in (b.x0, b.y0, b.x1 + 1, b.y1 + 1)))),
+    st.sampled_from(["whole", "cut", "cut to the box"]),
+    st.booleans(),
+)
+def test_to_the_letter_of_the_description(box: BoundingBox, arrives: str, masked: bool) -> None:
+    given_view = view(box)
+    if masked:
+        given_view = replace(given_view, mask=np.random.default_rng(1).random((150, 200)) < 0.7)
+    if arrives != "whole":
+        edges = (20, 10, 170, 140) if arrives == "cut" else (box.x0, box.y0, box.x1, box.y1)
+        x0, y0 = (int(np.clip(edge, 0, limit)) for edge, limit in zip(edges[:2], (199, 149), strict=True))
+        x1, y1 = max(x0 + 1, int(min(edges[2], 200))), max(y0 + 1, int(min(edges[3], 150)))
+        mask = None if given_view.mask is None else given_view.mask[y0:y1, x0:x1]
+        given_view = replace(given_view, image=given_view.image[y0:y1, x0:x1], origin=(x0, y0), mask=mask)
+    expected = by_the_description(given_view, SMALL.image_size)
+    if expected is None:
+        with pytest.raises(crops.CropError, match="lies beside its picture"):
+            crops.crop_view(given_view, SMALL)
+        return
+    image, parameters = crops.crop_view(given_view, SMALL)
+    assert plain(image) == pytest.approx(expected[0], abs=0.01)
+    assert parameters.tolist() == pytest.approx(expected[1], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        BoundingBox(20, 30, 120.5, 90.25),
+        BoundingBox(-40, -30, 35, 20),
+        BoundingBox(60, 70, 61, 71),
+        BoundingBox(0, 0, 200, 150),
+    ],
+    ids=["fractions", "partly outside", "one pixel", "whole image"],
+)
+def test_the_published_size_to_the_letter(box: BoundingBox) -> None:
+    image, parameters = crops.crop_view(view(box), PAPER)
+    expected = by_the_description(view(box), 224)
+    assert expected is not None
+    assert plain(image) == pytest.approx(expected[0], abs=0.01)
+    assert parameters.tolist() == pytest.approx(expected[1], abs=1e-6)
+
+
 @settings(max_examples=40)
 @given(boxes.filter(overlaps))
 def test_the_crop_is_the_padded_square_resized(box: BoundingBox) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import permutations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,11 +48,9 @@ def test_features(golden: Golden) -> None:
 @torch.no_grad()
 def test_energies_of_all_ordered_pairs(golden: Golden) -> None:
     features = golden.features
-    logits = torch.zeros(4, 4, len(golden.rotations))
-    for i in range(4):
-        for j in range(4):
-            if i != j:
-                logits[i, j] = golden.network.energies(features[i], features[j], golden.rotations)
+    logits = torch.zeros(len(features), len(features), len(golden.rotations))
+    for i, j in permutations(range(len(features)), 2):
+        logits[i, j] = golden.network.energies(features[i], features[j], golden.rotations)
     assert relative_error(logits, golden.expected["logits"]) < 1e-5
 
 
@@ -66,7 +65,7 @@ def test_the_joint_score_of_the_authors_solution(golden: Golden) -> None:
     """With the smooth and peaked energy that the authors' solver was run on; changed back afterwards."""
     network, features = golden.network, golden.features
     rotations = torch.from_numpy(golden.solver["rotations"])
-    i, j = np.triu_indices(4, 1)
+    i, j = np.triu_indices(len(features), 1)
     smoothing = 2.0 ** -(torch.arange(144) % 8)
     network.embed_query.weight *= smoothing
     network.layers[4].weight *= 8
