@@ -91,3 +91,11 @@ def test_no_file_names_a_place_on_somebodys_machine() -> None:
         if b"\0" not in content[:8192] and place.search(content):
             named.append(name)
     assert named == []
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "relpose_ros/weights/MODEL_CARD.md"])
+def test_a_page_links_to_what_is_there(page: str) -> None:
+    links = re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text(encoding="utf-8"))
+    local = [link for link in links if "://" not in link]
+    missing = [link for link in local if not (ROOT / page).parent.joinpath(link).exists()]
+    assert missing == []
