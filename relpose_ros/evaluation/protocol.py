@@ -46,7 +46,7 @@ EVIDENCE = {
 OF_THE_WEIGHTS = {*EVIDENCE, "constant-translation"}
 """The methods that ask the network."""
 OF_DISTRIBUTIONS = {"relpose", "both", "geometry"}
-"""The methods that do not differ from learned where the network regresses poses: nothing joins those."""
+"""The methods that a network which regresses poses has not: nothing joins those."""
 ORDERS = 5
 """Random orders a capture, as in the paper."""
 MEAN = "mean"
@@ -302,7 +302,7 @@ def evaluate(
         sequences: From `posed_views`, or made of a bag's views.
         views: Numbers of views, each 2 to 8.
         weights: Network file; None for the shipped weights.
-        methods: Among `METHODS`; None for all that differ from each other with these weights.
+        methods: Among `METHODS`; None for all that these weights have.
         output: Where to write ``{"rows": [...]}`` as JSON, or None.
         seed: Of the orders.
         variants: Network files of variants of the paper, each measured alone in rows that bear its name.
@@ -311,8 +311,8 @@ def evaluate(
         progress: Whether to show a progress bar on stderr.
 
     Raises:
-        EvaluationError: No captures, a number of views outside 2 to 8, an unknown method, or a file that
-            holds no variant or one that was named before.
+        EvaluationError: No captures, a number of views outside 2 to 8, a method that there is not (with
+            these weights), or a file that holds no variant or one that was named before.
         NetworkFileError: Weights cannot be loaded.
     """
     from tqdm import tqdm
@@ -353,9 +353,12 @@ def _methods(
             name: baselines.Estimated(name, estimator.resting_on(evidence))
             for name, evidence in EVIDENCE.items()
         }
+        without = OF_DISTRIBUTIONS if estimator.preset.rotation == "regression" else set()
+        if amiss := without.intersection(names or ()):
+            text = f"{weights} regresses poses, which nothing joins: measure 'learned', not {min(amiss)!r}."
+            raise EvaluationError(text)
         if names is None:
-            regresses = estimator.preset.rotation == "regression"
-            names = [name for name in METHODS if not (regresses and name in OF_DISTRIBUTIONS)]
+            names = [name for name in METHODS if name not in without]
     chosen: list[baselines.Method] = []
     for name in names or ():
         if name in EVIDENCE:

@@ -161,8 +161,11 @@ def test_what_is_no_variant_or_one_twice_is_refused(weights):
         protocol.evaluate([posed()], [2], methods=[], variants=[weights("pair-context")] * 2, progress=False)
 
 
-def test_weights_that_regress_are_measured_by_the_methods_that_differ(weights):
+def test_weights_that_regress_are_measured_by_the_methods_they_have(weights):
     sequence = posed(3)
+    for method in ("relpose", "both", "geometry"):
+        with pytest.raises(EvaluationError, match=f"measure 'learned', not '{method}'"):
+            protocol.evaluate([sequence], [2], weights("regression"), [method], progress=False)
     pytest.importorskip("pycolmap")
     rows = protocol.evaluate([sequence], [2], weights("regression"), orders=1, progress=False)
     methods = [row["method"] for row in rows if row["capture"] == "thing"]
