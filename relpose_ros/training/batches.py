@@ -66,6 +66,11 @@ class Scans:
         """Side of the crops, pixels."""
         return int(self._shards[0]["images"].shape[2])
 
+    @property
+    def views(self) -> int:
+        """Views that every scan has at least."""
+        return min(int(shard["images"].shape[1]) for shard in self._shards)
+
     def row(self, index: int) -> dict[str, npt.NDArray[Any]]:
         """One scan: the arrays of `FIELDS`, without copying them."""
         shard = int(np.searchsorted(self._ends, index, side="right"))
@@ -144,7 +149,13 @@ def make_batch(
         max_angle: Of `choose_views`, degrees.
         generator: The step's own.
         augmentation: None for the scans as they are.
+
+    Raises:
+        ShardError: There are scans of fewer views.
     """
+    if views > scans.views:
+        text = f"there are scans of {scans.views} views, and {views} were to be drawn; render scans of more."
+        raise ShardError(text)
     rows = []
     for _ in range(count):
         for _ in range(DRAWS):

@@ -116,6 +116,13 @@ def test_views_are_distinct_and_as_near_as_asked_where_there_are_enough(seed, co
     assert not within or any(limits)
 
 
+def test_scans_of_too_few_views_are_refused_in_a_sentence(fake_shard):
+    scans = Scans([fake_shard(1, 5, SIZE, 0), fake_shard(1, 4, SIZE, 1)])
+    batches.make_batch(scans, 2, 4, 180.0, np.random.default_rng(0))
+    with pytest.raises(ShardError, match="scans of 4 views, and 5 were to be drawn"):
+        batches.make_batch(scans, 2, 5, 180.0, np.random.default_rng(0))
+
+
 def test_a_batch_is_the_same_for_the_same_seed_and_another_for_another(fake_shard):
     scans = Scans([fake_shard(4, 6, 32, 0), fake_shard(3, 5, 32, 1)])
     assert len(scans) == 7
