@@ -151,6 +151,10 @@ def test_a_capture_becomes_a_bag_an_estimate_and_a_row(tmp_path, posed_capture, 
     assert cli.main(["replay", str(bag), "--output", str(again), "--config", str(parameters)]) == 0
     assert (again / "scan.json").read_bytes() == (out / "scan.json").read_bytes()
 
+    parameters.write_text(parameters.read_text() + "    precision: bfloat16\n")
+    assert cli.main(["replay", str(bag), "--output", str(again), "--config", str(parameters)]) == 0
+    assert (again / "scan.json").read_bytes() != (out / "scan.json").read_bytes()
+
     evaluate = ["evaluate", str(posed_capture), "--views", "2..3", "--orders", "1", "--output", str(rows)]
     assert (
         cli.main([*evaluate, "--method", "relpose", "--method", "identity", "--weights", str(random_weights)])

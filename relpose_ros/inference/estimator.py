@@ -138,6 +138,8 @@ class Estimator:
         path: Path | None = None,
         threads: int | None = None,
         evidence: EvidenceSettings = SHIPPED,
+        *,
+        backbone_in_bfloat16: bool = False,
     ) -> Estimator:
         """Loads weights and their calibration.
 
@@ -145,6 +147,7 @@ class Estimator:
             path: of a weights file; None for the shipped compact weights.
             threads: for torch, of the whole process; None or 0 leaves torch's own choice.
             evidence: what else than the network to rest on.
+            backbone_in_bfloat16: sooner on some processors, and less exact.
 
         Raises:
             NetworkFileError: if the file is missing or is none of ours.
@@ -152,6 +155,7 @@ class Estimator:
         if threads:
             torch.set_num_threads(threads)
         network = load_network(path)
+        network.backbone_in_bfloat16 = backbone_in_bfloat16
         stored = read_metadata(path).get("calibration")
         return cls(network, Calibration.from_json(stored) if stored else None, evidence)
 

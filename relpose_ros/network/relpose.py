@@ -9,6 +9,7 @@ released network's convention (see `relpose_ros.network.conventions`); `embed_re
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import torch
@@ -38,6 +39,8 @@ class RelPose(nn.Module):
     def __init__(self, preset: Preset) -> None:
         super().__init__()
         self.preset = preset
+        self.backbone_in_bfloat16 = False
+        """Whether `look` computes in bfloat16; all else is done, and told, in the weights' own type."""
         self.register_buffer("embedding", octaves(preset.rotation_frequencies)[None, None])
         self.feature_extractor = Encoder(preset)
         self.translation_regressor = Regressor(preset.token_width, preset.translation_widths, 3)
@@ -77,7 +80,12 @@ class RelPose(nn.Module):
                 f"This network takes crops of shape (N, 3, {side}, {side}); given {tuple(images.shape)}."
             )
         leading = images.shape[:-3]
-        pooled, maps = self.feature_extractor.look(images.flatten(0, -4))
+        # Not autocast with enabled=False: it would switch off the one that a caller is in.
+        lowered = torch.autocast(images.device.type, torch.bfloat16) if self.backbone_in_bfloat16 else None
+        with lowered or nullcontext():
+            pooled, maps = self.feature_extractor.look(images.flatten(0, -4))
+        if lowered:
+            pooled, maps = pooled.to(images.dtype), None if maps is None else maps.to(images.dtype)
         if maps is not None:
             maps = maps.reshape(*leading, *maps.shape[1:])
         return ViewFeatures(pooled.reshape(*leading, -1), maps)

@@ -279,12 +279,17 @@ class ScanNode(LifecycleNode):
         return TransitionCallbackReturn.FAILURE
 
     def _load_estimator(self) -> Estimator:
-        weights, threads = self._settings.weights_path, self._settings.threads
+        settings, weights = self._settings, self._settings.weights_path
         self.get_logger().info(f"Loading {weights or 'the shipped weights'}.")
         # Imported here, as is all that needs PyTorch: that takes seconds, in which a signal must be heard.
         from relpose_ros.inference.estimator import Estimator
 
-        return Estimator.from_weights(weights, threads or None, self._settings.evidence_settings)
+        return Estimator.from_weights(
+            weights,
+            settings.threads or None,
+            settings.evidence_settings,
+            backbone_in_bfloat16=settings.precision == "bfloat16",
+        )
 
     def _make_outputs(self) -> None:
         for name, message_type in OUTPUTS:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 NAMES = tuple(each.name for each in fields(ScanSettings))
 ONLY_UNCONFIGURED = frozenset(each.name for each in fields(ScanSettings) if each.metadata["fixed"]) | {
     "weights",
+    "precision",
     "threads",
 }
 """Read when the node is configured: setting one of them later would silently do nothing."""

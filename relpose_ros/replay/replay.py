@@ -147,7 +147,12 @@ def _learned_estimator(weights: Path | None, settings: ScanSettings) -> Supports
     from relpose_ros.inference.estimator import Estimator
 
     chosen = weights or settings.weights_path
-    return Estimator.from_weights(chosen, settings.threads or None, settings.evidence_settings)
+    return Estimator.from_weights(
+        chosen,
+        settings.threads or None,
+        settings.evidence_settings,
+        backbone_in_bfloat16=settings.precision == "bfloat16",
+    )
 
 
 def _cells(

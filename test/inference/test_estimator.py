@@ -172,6 +172,19 @@ def test_weights_bring_their_calibration(network, tmp_path):
     assert so3.angle_between(*both) < np.radians(0.5), "a temperature moves no maximum"
 
 
+def test_a_backbone_in_bfloat16_is_asked_for_when_weights_are_loaded(network, tmp_path):
+    file = tmp_path / "weights.safetensors"
+    write_network(network, file)
+    exact, lowered = (
+        Estimator.from_weights(
+            file, evidence=EvidenceSettings("network"), backbone_in_bfloat16=lower
+        ).estimate(scan(0, 1))
+        for lower in (False, True)
+    )
+    assert numbers(exact) != numbers(lowered)
+    assert lowered.pairs[0].entropy == pytest.approx(exact.pairs[0].entropy, abs=0.05)
+
+
 def test_rotations_of_features(network):
     estimator = Estimator(network)
     views = scan(0, 1, 2)

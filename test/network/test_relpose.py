@@ -170,6 +170,24 @@ def test_a_view_looked_at_alone_is_the_view_looked_at_among_others(compact: RelP
     )
 
 
+@torch.no_grad()
+def test_a_backbone_in_bfloat16_says_nearly_the_same_in_single_precision() -> None:
+    network = random_network("compact", 1)
+    images = torch.randn(2, 3, 128, 128, generator=torch.Generator().manual_seed(0))
+    exact = network.look(images)
+    network.backbone_in_bfloat16 = True
+    lowered = network.look(images)
+    assert exact.maps is not None
+    assert lowered.maps is not None
+    for ours, expected in ((lowered.pooled, exact.pooled), (lowered.maps, exact.maps)):
+        assert ours.dtype == torch.float32
+        error = float((ours - expected).norm() / expected.norm())
+        assert 1e-5 < error < 2e-2
+    assert torch.equal(network.look(images).pooled, lowered.pooled)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert network.look(images).pooled.dtype == torch.float32
+
+
 def test_features_are_indexed_by_view() -> None:
     features = SceneFeatures(torch.arange(24.0).reshape(2, 3, 4), torch.zeros(2, 3, 5, 6, 7))
     assert len(features) == 3
