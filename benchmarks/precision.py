@@ -7,8 +7,8 @@ of a pair's energy over rotations, because that, and no constant, is what a pair
 
 What pays is kept: the backbone in bfloat16, as the parameter ``precision`` of node and replay. On a processor
 with matrix units for it the published backbone takes half the time, and energies move by three hundredths of
-their spread; the transformer and the scoring in bfloat16 too save less and cost ten times as much. int8 saves
-a fifth at most, and compiling the small network makes it slower.
+their spread; the transformer and the scoring in bfloat16 too save less and cost ten times as much. int8 and
+compiling save a sixth at most, and compiling takes half a minute at every start.
 
 Compilation runs in a process of its own and is given up after a while: on some machines it takes many minutes
 for the compact network, more than it could ever save on a robot.

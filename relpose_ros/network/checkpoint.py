@@ -261,8 +261,8 @@ def _refusal(file: Path, err: Exception) -> str:
             f"which could run code; expected {_EXPECTED}."
         )
     # The text of the error would advise to open the file unsafely.
-    what = "holds more than tensors" if isinstance(err, pickle.UnpicklingError) else "is damaged or truncated"
-    return f"The weights file '{file}' was refused: it {what}; expected {_EXPECTED}."
+    more = " or holds more than tensors" if isinstance(err, pickle.UnpicklingError) else ""
+    return f"The weights file '{file}' was refused: it is damaged or truncated{more}; expected {_EXPECTED}."
 
 
 def _state_dict(content: Any, file: Path) -> Tensors:

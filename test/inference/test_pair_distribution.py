@@ -38,9 +38,9 @@ def test_a_flat_energy_is_uniform(fisher_scene, cameras_around):
 def test_normaliser_is_that_of_the_matrix_fisher_density(fisher_scene, cameras_around, concentration):
     """The mean of exp(k (tr R - 3)) is an integral over the angle, whose density is (1 - cos w) / pi."""
     _, found = searched(fisher_scene(cameras_around(2, 1), concentration))
-    angles = np.linspace(0, math.pi, 20_001)
+    angles = (np.arange(20_000) + 0.5) * math.pi / 20_000
     density = np.exp(2 * concentration * (np.cos(angles) - 1)) * (1 - np.cos(angles)) / math.pi
-    exact = math.log(np.trapezoid(density, angles))
+    exact = math.log(math.pi * density.mean())
     assert float(found.log_normaliser()[0]) == pytest.approx(exact, abs=0.08)
 
 
