@@ -303,7 +303,7 @@ def evaluate(
         views: Numbers of views, each 2 to 8.
         weights: Network file; None for the shipped weights.
         methods: Among `METHODS`; None for all that these weights have.
-        output: Where to write ``{"rows": [...]}`` as JSON, or None.
+        output: Where to write ``{"rows": [...]}`` as JSON, after each capture, or None.
         seed: Of the orders.
         variants: Network files of variants of the paper, each measured alone in rows that bear its name.
         orders: Random orders a capture.
@@ -312,7 +312,8 @@ def evaluate(
 
     Raises:
         EvaluationError: No captures, a number of views outside 2 to 8, a method that there is not (with
-            these weights), or a file that holds no variant or one that was named before.
+            these weights), a file that holds no variant or one that was named before, or an output that
+            cannot be written.
         NetworkFileError: Weights cannot be loaded.
     """
     from tqdm import tqdm
@@ -329,15 +330,27 @@ def evaluate(
     total = orders * len(chosen) * sum(n <= len(s.camera_from_world) for n in set(views) for s in sequences)
     with tqdm(total=total, unit="scan", disable=not progress) as bar:
         for sequence in sequences:
+            _write(
+                rows, output
+            )  # before the first capture, to know that it can be; then for who interrupts it
             bar.set_postfix_str(sequence.name)
             scans = _scans(sequence, chosen, views, orders, seed, bar.update)
             rows += _rows(sequence.name, scans)
             for key, group in scans.items():
                 everywhere.setdefault(key, []).extend(group)
     rows += [{**row, **_trust(everywhere[row["method"], row["views"]])} for row in mean_rows(rows)]
-    if output is not None:
-        output.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
+    _write(rows, output)
     return rows
+
+
+def _write(rows: Sequence[Row], output: Path | None) -> None:
+    if output is None:
+        return
+    try:
+        output.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
+    except OSError as err:
+        text = f"{output} cannot be written: {err.strerror}; name another file for the rows."
+        raise EvaluationError(text) from err
 
 
 def _methods(

@@ -114,6 +114,24 @@ def test_evaluate_writes_rows_and_their_mean(tmp_path):
     assert text[-1].split()[:4] == ["mean", "identity", "3", "4"]
 
 
+def test_what_was_measured_before_an_interruption_is_kept(tmp_path):
+    def interrupted(k):
+        raise KeyboardInterrupt
+
+    output = tmp_path / "rows.json"
+    sequences = [posed(name="one"), replace(posed(name="two"), view=interrupted)]
+    with pytest.raises(KeyboardInterrupt):
+        protocol.evaluate(sequences, [2], methods=["identity"], output=output, orders=1, progress=False)
+    assert [row["capture"] for row in json.loads(output.read_text())["rows"]] == ["one"]
+
+
+def test_an_output_that_cannot_be_written_is_told_before_the_work(tmp_path):
+    output = tmp_path / "nowhere" / "rows.json"
+    sequence = replace(posed(), view=pytest.fail)
+    with pytest.raises(EvaluationError, match=r"rows\.json cannot be written: No such file or directory"):
+        protocol.evaluate([sequence], [2], methods=["identity"], output=output, progress=False)
+
+
 def test_wrong_questions_are_answered_with_a_sentence():
     with pytest.raises(EvaluationError, match="no capture"):
         protocol.evaluate([], progress=False)
