@@ -363,7 +363,7 @@ def _methods(
     if names is None or OF_THE_WEIGHTS.intersection(names):
         estimator = Estimator.from_weights(weights, threads)
         estimating = {
-            name: baselines.Estimated(name, estimator.resting_on(evidence))
+            name: baselines.Estimated(name, estimator.with_evidence(evidence))
             for name, evidence in EVIDENCE.items()
         }
         without = OF_DISTRIBUTIONS if estimator.preset.rotation == "regression" else set()

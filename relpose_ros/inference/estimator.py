@@ -164,7 +164,7 @@ class Estimator:
         """Of its network."""
         return self._network.preset
 
-    def resting_on(self, evidence: EvidenceSettings) -> Estimator:
+    def with_evidence(self, evidence: EvidenceSettings) -> Estimator:
         """An estimator of the same weights and calibration with other evidence; they share nothing else."""
         return Estimator(self._network, self._calibration, evidence)
 

@@ -127,7 +127,7 @@ def test_each_view_is_looked_at_once_and_forgotten_with_the_view(network, monkey
 
 def test_other_evidence_on_the_same_weights(network):
     given = Estimator(network, CALIBRATED)
-    alone = given.resting_on(EvidenceSettings("network"))
+    alone = given.with_evidence(EvidenceSettings("network"))
     assert numbers(alone.estimate(scan(0, 1))) == numbers(
         Estimator(network, CALIBRATED, EvidenceSettings("network")).estimate(scan(0, 1))
     )
