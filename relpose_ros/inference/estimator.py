@@ -17,12 +17,13 @@ from relpose_ros.estimates import CameraPose, ScanEstimate
 from relpose_ros.geometry import cameras
 from relpose_ros.inference import bundle_adjustment
 from relpose_ros.inference.calibration import Calibration
-from relpose_ros.inference.camera_positions import baseline, place
+from relpose_ros.inference.camera_positions import apart, baseline, joined, place, rows_of
 from relpose_ros.inference.evidence import SHIPPED, EvidenceSettings
 from relpose_ros.inference.global_rotations import joint_scores, solve
 from relpose_ros.inference.matches import Matcher, peaks
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
+from relpose_ros.inference.refined_poses import settle
 from relpose_ros.inference.rotation_evidence import RotationEvidence
 from relpose_ros.inference.uncertainty import camera_covariances, describe_pairs
 from relpose_ros.inference.verdict import judge
@@ -32,10 +33,12 @@ from relpose_ros.network.features import ViewFeatures
 from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     import numpy.typing as npt
 
+    from relpose_ros.inference.camera_positions import Baseline
     from relpose_ros.inference.matches import TwoViewGeometry
     from relpose_ros.inference.pair_distribution import PairDistributions
     from relpose_ros.network.features import SceneFeatures
@@ -150,11 +153,10 @@ class Estimator:
             covariances = camera_covariances(
                 found.distributions, found.energies, solution, translations, found.calibration
             )
-            rotations, centres, covariances = self._place(
-                scan, found, solution.numpy(), translations, covariances
-            )
+            rotations, centres, joint = self._place(scan, found, solution.numpy(), translations, covariances)
             solution = torch.from_numpy(rotations)
             unit = self._evidence.first_view_distance or 1.0
+            covariances = apart(joint)
             covariances[:, :3] *= unit
             covariances[:, :, :3] *= unit
             pairs = describe_pairs(found.distributions, found.energies, solution, found.calibration)
@@ -227,18 +229,28 @@ class Estimator:
         translations: FloatArray,
         covariances: FloatArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Rotations, camera centres and covariances with what the matches say of positions."""
-        centres = cameras.camera_centre(rotations, translations)
-        baselines = []
-        for (i, j), geometry in found.geometries.items():
-            if geometry.agrees(rotations[j] @ rotations[i].T):
-                pose, turn = geometry.poses[0], covariances[j, 3:, 3:]
-                baselines.append(
-                    baseline(i, j, rotations[j], pose.direction, pose.direction_covariance, turn)
-                )
-        centres, covariances = place(centres, covariances, baselines)
+        """Rotations, camera centres and their joint covariance with what the matches say of positions."""
+        centres, joint = cameras.camera_centre(rotations, translations), joined(covariances)
+        baselines = _baselines(found.geometries, rotations, covariances)
+        placed, placed_joint = place(centres, joint, baselines)
+        refined = self._refine(scan, found, rotations, placed)
+        if refined is None:
+            return rotations, placed, placed_joint
+        settled, settled_joint = settle(refined, placed_joint)
+        others = [camera for camera in range(len(rotations)) if camera not in refined.moved]
+        # The directions between cameras that moved are told already, and better.
+        left = [each for each in baselines if each.i in others or each.j in others]
+        settled[others] = centres[others]
+        rows = rows_of(others)
+        settled_joint[np.ix_(rows, rows)] = joint[np.ix_(rows, rows)]
+        return refined.rotations, *place(settled, settled_joint, left)
+
+    def _refine(
+        self, scan: Scan, found: _Found, rotations: FloatArray, centres: FloatArray
+    ) -> bundle_adjustment.Refined | None:
+        """What a bundle adjustment makes of the poses, where it improves them."""
         if self._matcher is None or self._evidence.use != "refine":
-            return rotations, centres, covariances
+            return None
         refined = bundle_adjustment.refine(
             rotations,
             cameras.translation_of(rotations, centres),
@@ -246,12 +258,10 @@ class Estimator:
             found.geometries,
         )
         if refined is None:
-            return rotations, centres, covariances
+            return None
         both = torch.from_numpy(np.stack([rotations, refined.rotations]))
         before, after = joint_scores(found.energies, both).tolist()
-        if after < before - CONTRADICTION * found.energies.count:
-            return rotations, centres, covariances
-        return refined.rotations, cameras.camera_centre(refined.rotations, refined.translations), covariances
+        return None if after < before - CONTRADICTION * found.energies.count else refined
 
     def _features(self, scan: Scan) -> SceneFeatures:
         looks = []
@@ -264,3 +274,17 @@ class Estimator:
             looks.append(self._looks[view])
         stacked = torch.stack([crop_parameters for _, crop_parameters in looks])
         return self._network.relate(ViewFeatures.stack([look for look, _ in looks]), stacked)
+
+
+def _baselines(
+    geometries: Mapping[tuple[int, int], TwoViewGeometry], rotations: FloatArray, covariances: FloatArray
+) -> list[Baseline]:
+    """The directions between cameras by those pairs' matches that agree with their rotations."""
+    return [
+        baseline(
+            *(i, j, rotations[j], geometry.poses[0].direction, geometry.poses[0].direction_covariance),
+            covariances[j, 3:, 3:],
+        )
+        for (i, j), geometry in geometries.items()
+        if geometry.agrees(rotations[j] @ rotations[i].T)
+    ]
