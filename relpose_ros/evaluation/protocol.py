@@ -30,9 +30,14 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 """One line of the result: capture, method, views, scans, the figures of `metrics.summary`, seconds."""
 
-METHODS = ("relpose", "both", "learned", "geometry", "constant-translation", "identity", "colmap")
-"""relpose is the estimator as it ships: the network, matches and refinement. both leaves out the refinement,
-learned the matches too, geometry the network."""
+METHODS = (
+    *("relpose", "relpose-known", "both", "learned", "geometry"),
+    *("constant-translation", "identity", "colmap"),
+)
+"""relpose is the estimator as it ships: the network, matches and refinement; relpose-known its cameras that
+it calls known itself. both leaves out the refinement, learned the matches too, geometry the network."""
+DERIVED = {"relpose-known": "relpose", "constant-translation": "learned"}
+"""Methods that change the answer of another one."""
 EVIDENCE = {
     "relpose": EvidenceSettings("refine"),
     "both": EvidenceSettings("pairs"),
@@ -268,7 +273,7 @@ def _methods(
     chosen: list[baselines.Method] = []
     estimating: dict[str, baselines.Estimated] = {}
     for name in names:
-        of = "learned" if name == "constant-translation" else name
+        of = DERIVED.get(name, name)
         if of in EVIDENCE and of not in estimating:
             from relpose_ros.inference.estimator import Estimator
 
@@ -277,7 +282,9 @@ def _methods(
         if name in EVIDENCE:
             chosen.append(estimating[name])
         elif name == "constant-translation":
-            chosen.append(baselines.ConstantTranslation(estimating["learned"]))
+            chosen.append(baselines.ConstantTranslation(estimating[of]))
+        elif name == "relpose-known":
+            chosen.append(baselines.Known(name, estimating[of]))
         elif name == "identity":
             chosen.append(baselines.Identity())
         elif name == "colmap":
