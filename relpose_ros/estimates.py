@@ -91,6 +91,20 @@ class CameraPose:
 
 
 @dataclass(frozen=True, eq=False)
+class ObjectPose:
+    """The object frame in the robot's frame."""
+
+    frame_id: str
+    """The robot's frame."""
+    robot_from_object: FloatArray
+    """(3, 3) rotation."""
+    position: FloatArray
+    """(3,) the object frame's origin in the robot's frame, metres."""
+    covariance: FloatArray
+    """(6, 6) of x, y, z and the rotation about X, Y, Z, fixed axes of the robot's frame: m^2, rad^2."""
+
+
+@dataclass(frozen=True, eq=False)
 class ScanEstimate:
     """The poses of all views of a scan, the pairs they rest on, and a verdict."""
 
@@ -112,3 +126,8 @@ class ScanEstimate:
     """The verdict in words, for a person."""
     seconds: float
     """Wall-clock time the estimate took; 0 in a replay, whose files must not differ between runs."""
+    scale_deviation: float = 0.0
+    """Standard deviation of the scale, relative to it, where it follows from the robot's camera poses; 0
+    elsewhere. The cameras' covariances contain it."""
+    object_pose: ObjectPose | None = None
+    """Where the scale follows from the robot's camera poses."""

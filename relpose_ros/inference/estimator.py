@@ -24,6 +24,7 @@ from relpose_ros.inference.matches import Matcher, peaks
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 from relpose_ros.inference.refined_poses import settle
+from relpose_ros.inference.robot_frame import RobotFrame, find_robot_frame
 from relpose_ros.inference.rotation_evidence import RotationEvidence
 from relpose_ros.inference.uncertainty import camera_covariances, describe_pairs
 from relpose_ros.inference.verdict import judge
@@ -155,26 +156,32 @@ class Estimator:
             )
             rotations, centres, joint = self._place(scan, found, solution.numpy(), translations, covariances)
             solution = torch.from_numpy(rotations)
-            unit = self._evidence.first_view_distance or 1.0
-            covariances = apart(joint)
-            covariances[:, :3] *= unit
-            covariances[:, :, :3] *= unit
+            robot = find_robot_frame(rotations, centres, joint, scan.robot_poses) if scan.robot_poses else ""
+            in_robot = robot if isinstance(robot, RobotFrame) else None
+            unit, deviation = self._evidence.first_view_distance or 1.0, 0.0
+            if in_robot is not None:
+                unit, deviation = in_robot.scale, in_robot.deviation
+            centres, covariances = _scaled(centres, apart(joint), unit, deviation)
             pairs = describe_pairs(found.distributions, found.energies, solution, found.calibration)
             verdict, weakest, status = judge(pairs, covariances, self._calibration is not None)
+            if isinstance(robot, str) and robot:
+                status += f" (the robot's camera poses do not tell the scale: {robot})"
             return ScanEstimate(
                 object_id=scan.object_id,
                 cameras=tuple(
-                    CameraPose(view, rotations[view].T, unit * centres[view], covariances[view])
+                    CameraPose(view, rotations[view].T, centres[view], covariances[view])
                     for view in range(len(scan.views))
                 ),
                 pairs=pairs,
                 score=float(joint_scores(found.energies, solution[None])[0]),
-                scale_known=self._evidence.first_view_distance > 0,
+                scale_known=in_robot is not None or self._evidence.first_view_distance > 0,
                 calibrated=self._calibration is not None,
                 verdict=verdict,
                 weakest_pair=weakest,
                 status=status,
                 seconds=time.perf_counter() - start,
+                scale_deviation=deviation,
+                object_pose=None if in_robot is None else in_robot.object_pose,
             )
 
     @torch.no_grad()
@@ -288,3 +295,13 @@ def _baselines(
         for (i, j), geometry in geometries.items()
         if geometry.agrees(rotations[j] @ rotations[i].T)
     ]
+
+
+def _scaled(
+    centres: FloatArray, covariances: FloatArray, unit: float, deviation: float
+) -> tuple[FloatArray, FloatArray]:
+    """Centres (N, 3) and covariances (N, 6, 6) in another unit, itself known to a relative deviation."""
+    centres, scale = unit * centres, np.repeat([unit, 1.0], 3)
+    covariances = scale[:, None] * covariances * scale
+    covariances[:, :3, :3] += deviation**2 * centres[:, :, None] * centres[:, None, :]
+    return centres, covariances

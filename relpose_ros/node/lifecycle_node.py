@@ -18,7 +18,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, JumpThreshold
@@ -57,6 +57,9 @@ INPUTS: tuple[tuple[Kind, str, Any, str], ...] = (
     ("object_view", "object_view", ObjectView, ""),
     ("image", "image", Image, "raw"),
     ("compressed", "image/compressed", CompressedImage, "compressed"),
+    ("camera_info", "camera_info", CameraInfo, ""),
+    ("camera_pose", "camera_pose", PoseStamped, ""),
+    ("camera_pose", "camera_pose_with_covariance", PoseWithCovarianceStamped, ""),
 )
 """Kind, topic, type, and the image transport that must be asked for (empty: always there)."""
 
@@ -270,8 +273,9 @@ class ScanNode(LifecycleNode):
 
     def _make_inputs(self, scanner: Scanner) -> None:
         transports = self._settings.image_transports
-        wanted = [each[:3] for each in INPUTS if not each[3] or each[3] in transports]
-        for kind, name, message_type in [*wanted, ("camera_info", "camera_info", CameraInfo)]:
+        for kind, name, message_type, transport in INPUTS:
+            if transport and transport not in transports:
+                continue
             topic = self.resolve_topic_name(name)
             events = SubscriptionEventCallbacks(
                 incompatible_qos=functools.partial(self._on_incompatible_qos, topic, True),
