@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, get_args
 
 from relpose_ros.errors import RelPoseError
 from relpose_ros.estimates import Verdict
+from relpose_ros.inference.verdict import without_room
 from relpose_ros.scanning.incoming import (
     Arrival,
     Pairing,
@@ -418,6 +419,9 @@ class Scanner:
             scan = Scan(state.buffer.object_id, work.views, poses)
             try:
                 estimate = self._estimator.estimate(scan)
+                if len(scan.views) >= self._settings.max_views:
+                    words = without_room(estimate.status, self._settings.keep)
+                    estimate = replace(estimate, status=words)
             except Exception as err:
                 text = f"The estimate of {scan.object_id!r} from {len(scan.views)} views failed: {err}."
                 # A sentence for the user needs no traceback, a defect does.

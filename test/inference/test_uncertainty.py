@@ -16,7 +16,7 @@ from relpose_ros.inference.global_rotations import solve
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 from relpose_ros.inference.uncertainty import FLOOR, _turns, camera_covariances, describe_pairs
-from relpose_ros.inference.verdict import judge
+from relpose_ros.inference.verdict import judge, without_room
 
 UNCALIBRATED = Calibration()
 UNIFORM_VARIANCE = (math.pi**2 / 3 + 2) / 3  # per axis, of a uniformly random rotation's vector
@@ -145,7 +145,27 @@ def test_enough_needs_trusted_pairs_and_calibrated_ones(fisher_scene, cameras_ar
     assert words.startswith("enough: 3 of 3 pairs agree")
     verdict, _, words = judge(pairs, covariances, calibrated=False)
     assert verdict is Verdict.ONE_MORE_VIEW
-    assert "not calibrated" in words
+    assert words.startswith("not enough: these weights are not calibrated")
+
+
+@pytest.mark.parametrize(
+    ("keep", "advice"),
+    [
+        ("first", "drop_last_view makes room for another one, reset for all"),
+        ("latest", "the next one takes the place of the oldest"),
+        ("spread", "the next one from a new direction takes the place of the view that tells least"),
+    ],
+)
+def test_a_full_scan_is_told_what_to_do_instead_of_one_more_view(keep, advice):
+    words = without_room("one more view: pair 2-5 is ambiguous by about 180 degrees", keep)
+    assert words == f"no room for one more view: pair 2-5 is ambiguous by about 180 degrees; {advice}"
+
+
+@pytest.mark.parametrize(
+    "words", ["enough: 3 of 3 pairs agree", "not enough: these weights are not calibrated"]
+)
+def test_what_asks_for_no_view_stays_as_it_is(words):
+    assert without_room(words, "spread") == words
 
 
 def test_the_verdict_names_the_ambiguous_pair(fisher_scene, cameras_around):

@@ -3,6 +3,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from relpose_ros.errors import RelPoseError
 from relpose_ros.estimates import Verdict
+from relpose_ros.inference.verdict import WITHOUT_ROOM
 from relpose_ros.scanning.image_decoding import ENCODINGS
 from relpose_ros.scanning.scan_buffer import ScanBuffer
 from relpose_ros.scanning.scanner import Receipt, Scanner, TopicStatistics
@@ -682,6 +684,24 @@ def test_how_long_a_callback_takes(
         print(f"\n1920 x 1080 {kind}: median {np.median(spent):.2f} ms, slowest {max(spent):.2f} ms")
     (result,) = drain(scanner)
     assert result.scan.views[0].image.shape == (600, 600, 3)
+
+
+@pytest.mark.parametrize("keep", ["first", "latest", "spread"])
+def test_a_full_scan_is_not_told_to_take_one_more_view(
+    bag_messages: Any, circle_estimator: Callable[..., Any], keep: str
+) -> None:
+    inner = circle_estimator()
+
+    def estimate(scan: Scan) -> ScanEstimate:
+        return replace(inner.estimate(scan), status="one more view: pair 0-1 knows hardly anything")
+
+    scanner = Scanner(SimpleNamespace(estimate=estimate), ScanSettings(max_views=3, keep=keep))
+    told = []
+    for stamp in (1, 2, 3):
+        send_views(scanner, bag_messages, stamp)
+        told += [result.estimate.status for result in drain(scanner)]
+    assert told[0] == "one more view: pair 0-1 knows hardly anything"
+    assert told[1] == f"no room for {told[0]}; {WITHOUT_ROOM[keep]}"
 
 
 def send_pose(scanner: Scanner, messages: Any, stamp: float, x: float = 0.0, **fields: Any) -> Receipt:
