@@ -17,6 +17,7 @@ import numpy as np
 
 from relpose_ros.estimates import ObjectPose
 from relpose_ros.geometry import so3
+from relpose_ros.inference.camera_positions import apart, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -32,6 +33,9 @@ LARGEST_DEVIATION = 0.15
 CONTRADICTION = 4.0
 """Squared deviations relative to what the covariances say, a degree of freedom: from here on poses contradict
 each other, since twice the stated deviation on average is no chance."""
+UNKNOWN = math.radians(20)
+"""Standard deviation of a camera's rotation, worst axis, from which on its estimate takes no part: how far
+such turns move a camera is not linear, and it could tell little."""
 ROUNDS = 5
 """Of Gauss and Newton; from the closed form two are enough."""
 UNKNOWNS = 7
@@ -83,9 +87,13 @@ def find_robot_frame(
     if not frames:
         return "no camera pose of the robot is known"
     frame = frames.most_common(1)[0][0]
-    cameras = [k for k, pose in enumerate(poses) if pose is not None and pose.frame_id == frame]
-    if len(cameras) < 2:
+    told = [k for k, pose in enumerate(poses) if pose is not None and pose.frame_id == frame]
+    if len(told) < 2:
         return "the camera pose of one view alone is known in the robot's frame"
+    turns = apart(covariance)[:, 3:, 3:]
+    cameras = [k for k in told if np.linalg.eigvalsh(turns[k])[-1] < UNKNOWN**2]
+    if len(cameras) < 2:
+        return "of the views whose camera pose is known, less than two are tied to the others"
     problem = _Problem(rotations, centres, covariance, poses)
     for chosen in _majorities(cameras):
         fits = [fit for subset in chosen if (fit := problem.fit(subset)) is not None]
@@ -135,7 +143,7 @@ class _Problem:
         rotation = so3.project(np.einsum("nab,nbc->ac", turned, found))
         scale = lengths[1] / lengths[0]
         shift = (wanted - scale * centres @ rotation.T).mean(0)
-        rows = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in cameras])
+        rows = rows_of(cameras)
         spread = self._covariance[np.ix_(rows, rows)]
         stated = np.zeros_like(spread)
         for slot, pose in enumerate(known):

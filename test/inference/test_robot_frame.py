@@ -196,6 +196,18 @@ def test_views_without_a_pose_and_poses_in_another_frame_are_left_out():
     assert found.object_pose.frame_id == "base"
 
 
+def test_a_camera_whose_own_pose_nobody_knows_takes_no_part():
+    rotations, centres, poses = noisy(4, 8)
+    covariance = spread(4, 0.02, 0.02)
+    covariance[6:12, 6:12] = np.diag([1.0] * 3 + [math.radians(60) ** 2] * 3)
+    known = find_robot_frame(rotations, centres, covariance, poses)
+    rotations[1], centres[1] = so3.exp([0, 2.5, 0]) @ rotations[1], -centres[1]
+    wrong = find_robot_frame(rotations, centres, covariance, poses)
+    assert (wrong.scale, wrong.deviation) == (known.scale, known.deviation)
+    pair = find_robot_frame(rotations, centres, covariance, [*poses[:2], None, None])
+    assert pair == "of the views whose camera pose is known, less than two are tied to the others"
+
+
 @pytest.mark.parametrize(
     ("known", "reason"),
     [
