@@ -21,9 +21,6 @@ NAMES = tuple(each.name for each in fields(ScanSettings))
 ONLY_UNCONFIGURED = frozenset(each.name for each in fields(ScanSettings) if each.metadata["fixed"]) | {
     "weights",
     "threads",
-    "evidence",
-    "surroundings",
-    "first_view_distance",
 }
 """Read when the node is configured: setting one of them later would silently do nothing."""
 
