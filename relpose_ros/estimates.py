@@ -44,7 +44,8 @@ class Mode:
     weight: float
     """Probability mass of the mode's basin, 0 to 1."""
     covariance: FloatArray
-    """(3, 3), rad^2, of the rotation vector in the axes of camera j (left perturbation)."""
+    """(3, 3), rad^2, of the rotation vector in the axes of camera j (left perturbation): how exact the mode
+    is where it is right. Mass far from it counts little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,8 @@ class PairRotation:
     camera_j_from_camera_i: FloatArray
     """(3, 3) rotation of the strongest mode."""
     covariance: FloatArray
-    """(3, 3), rad^2: total second moment of the distribution about the strongest mode, axes of camera j."""
+    """(3, 3), rad^2: total second moment of the distribution about the strongest mode, axes of camera j.
+    Other modes and whatever chance there is that none is right make it large."""
     entropy: float
     """Nats, relative to the uniform distribution on SO(3): 0 knows nothing, lower knows more."""
     probability_within_15_deg: float

@@ -49,6 +49,22 @@ def test_a_sharp_pair_has_the_covariance_of_its_density(fisher_scene, cameras_ar
     assert pair.entropy < -3
 
 
+def test_a_modes_covariance_is_that_of_its_core_and_the_total_one_holds_all(fisher_scene, cameras_around):
+    """A sharp peak, a sixth of near misses ten degrees off, a twentieth that may be anywhere."""
+    scene = fisher_scene(cameras_around(2, 0))
+    true = scene.relative(0, 1)
+    sharp = 400.0
+    # exp(-k |w|^2) holds (pi / k)^(3/2) of the 8 pi^2 that all rotations have.
+    heights = [(share * 8 * math.sqrt(math.pi) * k**1.5, k) for share, k in ((0.8, sharp), (0.15, 30.0))]
+    scene.mixtures[0, 1] = [(true, math.log(height), k) for height, k in [*heights, (0.05, 0.0)]]
+    (pair,), _, _ = told(scene)
+    exact = 1 / (2 * sharp)
+    own = np.trace(pair.modes[0].covariance) / 3
+    assert exact < own < 2.5 * exact
+    assert np.trace(pair.covariance) / 3 > 5 * exact
+    assert pair.modes[0].weight > 0.85
+
+
 @pytest.mark.parametrize("concentration", [5.0, 20.0, 80.0])
 def test_probability_within_15_degrees_is_that_of_the_density(fisher_scene, cameras_around, concentration):
     (pair,), _, _ = told(fisher_scene(cameras_around(2, 1), concentration))
