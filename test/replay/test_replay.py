@@ -401,6 +401,7 @@ def test_the_robots_camera_poses_reach_the_estimator(
     sent = records(tmp_path / "out/estimates")[-3].message
     assert sent.object_pose.header.frame_id == "world"
     assert sent.object_pose.pose.pose.position.x == 0.3
+    assert "Positions are in metres, their scale to 5 %." in (tmp_path / "out/report.html").read_text()
 
 
 def test_camera_poses_of_no_view_are_told(
