@@ -44,7 +44,8 @@ class Mode:
     weight: float
     """Probability mass of the mode's basin, 0 to 1."""
     covariance: FloatArray
-    """(3, 3), rad^2, of the rotation vector in the axes of camera j (left perturbation)."""
+    """(3, 3), rad^2, of the rotation vector in the axes of camera j (left perturbation): how exact the mode
+    is where it is right. Mass far from it counts little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,8 @@ class PairRotation:
     camera_j_from_camera_i: FloatArray
     """(3, 3) rotation of the strongest mode."""
     covariance: FloatArray
-    """(3, 3), rad^2: total second moment of the distribution about the strongest mode, axes of camera j."""
+    """(3, 3), rad^2: total second moment of the distribution about the strongest mode, axes of camera j.
+    Other modes and whatever chance there is that none is right make it large."""
     entropy: float
     """Nats, relative to the uniform distribution on SO(3): 0 knows nothing, lower knows more."""
     probability_within_15_deg: float
@@ -91,6 +93,20 @@ class CameraPose:
 
 
 @dataclass(frozen=True, eq=False)
+class ObjectPose:
+    """The object frame in the robot's frame."""
+
+    frame_id: str
+    """The robot's frame."""
+    robot_from_object: FloatArray
+    """(3, 3) rotation."""
+    position: FloatArray
+    """(3,) the object frame's origin in the robot's frame, metres."""
+    covariance: FloatArray
+    """(6, 6) of x, y, z and the rotation about X, Y, Z, fixed axes of the robot's frame: m^2, rad^2."""
+
+
+@dataclass(frozen=True, eq=False)
 class ScanEstimate:
     """The poses of all views of a scan, the pairs they rest on, and a verdict."""
 
@@ -112,3 +128,8 @@ class ScanEstimate:
     """The verdict in words, for a person."""
     seconds: float
     """Wall-clock time the estimate took; 0 in a replay, whose files must not differ between runs."""
+    scale_deviation: float = 0.0
+    """Standard deviation of the scale, relative to it, where it follows from the robot's camera poses; 0
+    elsewhere. The cameras' covariances contain it."""
+    object_pose: ObjectPose | None = None
+    """Where the scale follows from the robot's camera poses."""

@@ -78,8 +78,26 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
+class RobotPose:
+    """Where a robot says that a camera stood: its optical frame in a frame of the robot's that stays put."""
+
+    frame_id: str
+    """That frame: the robot's base, odom, map. Called ``robot`` below."""
+    robot_from_camera: npt.NDArray[np.float64]
+    """(3, 3) rotation."""
+    position: npt.NDArray[np.float64]
+    """(3,) camera centre in the robot's frame, metres."""
+    covariance: npt.NDArray[np.float64]
+    """(6, 6) of x, y, z and the rotation about X, Y, Z, fixed axes of the robot's frame
+    (geometry_msgs/PoseWithCovariance): m^2, rad^2."""
+
+
+@dataclass(frozen=True, eq=False)
 class Scan:
     """The views held of one object, oldest first. The first one sets the gauge of the estimate."""
 
     object_id: str
     views: tuple[View, ...]
+    robot_poses: tuple[RobotPose | None, ...] = ()
+    """One per view, None where nobody said; empty where nobody said anything. They may come after their
+    views, so they are not a part of them."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from relpose_ros.geometry.cameras import translation_of
+from relpose_ros.inference.verdict import LARGEST_DEVIATION
 from relpose_ros.views import Scan
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ class Poses:
     """(N, 3, 3), nan where the method has no answer."""
     translations: FloatArray
     """(N, 3), nan likewise."""
+    deviations: FloatArray | None = None
+    """(N,) stated standard deviation of each rotation about its worst axis, rad; None: not stated."""
     estimate: ScanEstimate | None = None
     """What else the method says, where it is an estimator."""
 
@@ -63,8 +66,33 @@ class Estimated:
             estimate = self._estimator.estimate(Scan(object_id="evaluation", views=key))
             rotations = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
             positions = np.stack([camera.position for camera in estimate.cameras])
-            self._last = key, Poses(rotations, translation_of(rotations, positions), estimate)
+            spreads = np.stack([camera.covariance[3:, 3:] for camera in estimate.cameras])
+            deviations = np.sqrt(np.linalg.eigvalsh(spreads)[:, -1])
+            translations = translation_of(rotations, positions)
+            self._last = key, Poses(rotations, translations, deviations, estimate)
         return self._last[1]
+
+
+class Known:
+    """The cameras of an estimate that it calls known itself.
+
+    A camera that nothing ties to the others is placed anywhere, and one such camera turns and shrinks the
+    alignment in which all centres are measured. COLMAP leaves it out; so does this.
+    """
+
+    def __init__(self, name: str, poses_from: Method) -> None:
+        """Take the poses of a method that states deviations."""
+        self.name = name
+        self._method = poses_from
+
+    def poses(self, views: Sequence[View]) -> Poses:
+        """See `Method`."""
+        poses = self._method.poses(views)
+        assert poses.deviations is not None
+        unknown = poses.deviations > LARGEST_DEVIATION
+        rotations, translations = poses.rotations.copy(), poses.translations.copy()
+        rotations[unknown], translations[unknown] = np.nan, np.nan
+        return Poses(rotations, translations, poses.deviations)
 
 
 class ConstantTranslation:

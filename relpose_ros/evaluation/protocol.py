@@ -33,9 +33,14 @@ Row = dict[str, Any]
 """One line of the result: capture, method, views, scans, the figures of `metrics.summary`, seconds; where the
 method is an estimator, those of `trust.summary` too."""
 
-METHODS = ("relpose", "both", "learned", "geometry", "constant-translation", "identity", "colmap")
-"""relpose is the estimator as it ships: the network, matches and refinement. both leaves out the refinement,
-learned the matches too, geometry the network."""
+METHODS = (
+    *("relpose", "relpose-known", "both", "learned", "geometry"),
+    *("constant-translation", "identity", "colmap"),
+)
+"""relpose is the estimator as it ships: the network, matches and refinement; relpose-known its cameras that
+it calls known itself. both leaves out the refinement, learned the matches too, geometry the network."""
+DERIVED = {"relpose-known": "relpose", "constant-translation": "learned"}
+"""Methods that change the answer of another one."""
 EVIDENCE = {
     "relpose": EvidenceSettings("refine"),
     "both": EvidenceSettings("pairs"),
@@ -45,7 +50,7 @@ EVIDENCE = {
 """What the estimator rests on in each of these methods."""
 OF_THE_WEIGHTS = {*EVIDENCE, "constant-translation"}
 """The methods that ask the network."""
-OF_DISTRIBUTIONS = {"relpose", "both", "geometry"}
+OF_DISTRIBUTIONS = {"relpose", "relpose-known", "both", "geometry"}
 """The methods that a network which regresses poses has not: nothing joins those."""
 ORDERS = 5
 """Random orders a capture, as in the paper."""
@@ -374,10 +379,13 @@ def _methods(
             names = [name for name in METHODS if name not in without]
     chosen: list[baselines.Method] = []
     for name in names or ():
+        of = DERIVED.get(name, name)
         if name in EVIDENCE:
             chosen.append(estimating[name])
         elif name == "constant-translation":
-            chosen.append(baselines.ConstantTranslation(estimating["learned"]))
+            chosen.append(baselines.ConstantTranslation(estimating[of]))
+        elif name == "relpose-known":
+            chosen.append(baselines.Known(name, estimating[of]))
         elif name == "identity":
             chosen.append(baselines.Identity())
         elif name == "colmap":

@@ -52,6 +52,8 @@ class Refined:
     error_before: float
     """Median reprojection error, pixels."""
     error_after: float
+    information: FloatArray
+    """(6 M, 6 M) what the points tell of the M cameras that took part, see `information`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +110,53 @@ def refine(
         points, _ = _triangulate(here, chosen)
         here = _adjust(here, points, chosen, scale, (rotations, translations))
     _, before_errors = _triangulate((rotations, translations), chosen)
-    _, after_errors = _triangulate(here, chosen)
+    points, after_errors = _triangulate(here, chosen)
     before, after = float(np.median(before_errors)), float(np.median(after_errors))
     if not after < before:
         return None
-    return Refined(here[0], here[1], tuple(np.unique(chosen.camera).tolist()), before, after)
+    members = tuple(np.unique(chosen.camera).tolist())
+    return Refined(here[0], here[1], members, before, after, information(here, points, chosen))
+
+
+def information(poses: tuple[FloatArray, FloatArray], points: FloatArray, seen: _Observations) -> FloatArray:
+    """What the sightings tell of the poses whatever the points are: the normal matrix without them.
+
+    Nothing is held, so that it is silent on where all cameras stand together, how they are turned and their
+    unit of length. The errors are taken at their own scale, as independent.
+
+    Returns:
+        (6 M, 6 M), for each of the M cameras that see something its turn (left perturbation of
+        camera_from_object, rad) and its translation.
+    """
+    rotations, translations = poses
+    members, slot = np.unique(seen.camera, return_inverse=True)
+    turned = np.einsum("qab,qb->qa", rotations[seen.camera], points[seen.point])
+    p = turned + translations[seen.camera]
+    by_p = np.zeros((len(p), 2, 3))
+    by_p[:, 0, 0] = by_p[:, 1, 1] = 1 / p[:, 2]
+    by_p[:, :, 2] = -p[:, :2] / p[:, 2:] ** 2
+    by_p /= seen.pixel[:, None, None]
+    error = (p[:, :2] / p[:, 2:] - seen.rays) / seen.pixel[:, None]
+    weight = 1 / (1 + (error**2).sum(1) / ROUNDS[-1][1] ** 2) ** 2
+    free = error.size - points.size - 6 * len(members) + 7
+    # The median length of a Gaussian error in two dimensions is 1.18 deviations; what the points and poses
+    # took up of it is given back. No feature is more exact than a third of a pixel.
+    deviation = float(np.median(np.linalg.norm(error, axis=1))) / 1.18 * math.sqrt(error.size / max(free, 1))
+    weight /= max(deviation, 1 / 3) ** 2
+    by_pose = np.concatenate([by_p @ -so3.hat(turned), by_p], 2)
+    by_point = by_p @ rotations[seen.camera]
+    own = np.zeros((len(members), 6, len(members), 6))
+    crossed = np.zeros((len(members), 6, len(points), 3))
+    of_points = np.zeros((len(points), 3, 3))
+    weighted = weight[:, None, None] * by_pose.transpose(0, 2, 1)
+    np.add.at(own.transpose(0, 2, 1, 3), (slot, slot), weighted @ by_pose)
+    np.add.at(crossed.transpose(0, 2, 1, 3), (slot, seen.point), weighted @ by_point)
+    np.add.at(of_points, seen.point, weight[:, None, None] * by_point.transpose(0, 2, 1) @ by_point)
+    # A point whose sightings all went astray holds nothing.
+    of_points += 1e-9 * np.eye(3)
+    left = np.einsum("mapb,pbc->mapc", crossed, np.linalg.inv(of_points)).reshape(6 * len(members), -1)
+    size = 6 * len(members)
+    return np.asarray(own.reshape(size, size) - left @ crossed.reshape(size, -1).T)
 
 
 def _agreeing(

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     FloatArray = npt.NDArray[np.float64]
+    IntArray = npt.NDArray[np.int64]
 
 ROUNDS = 8
 """Of reweighting: a direction's weight depends on the cameras' distance and on how well it fits."""
@@ -56,30 +57,47 @@ def baseline(
     return Baseline(i, j, towards, camera_from_object.T @ covariance @ camera_from_object + swing)
 
 
+def joined(covariances: FloatArray) -> FloatArray:
+    """The joint covariance of cameras that err each for themselves. (N, 6, 6) -> (6 N, 6 N)."""
+    joint = np.zeros((len(covariances), 6, len(covariances), 6))
+    cameras = np.arange(len(covariances))
+    joint[cameras, :, cameras] = covariances
+    return joint.reshape(6 * len(covariances), -1)
+
+
+def apart(joint: FloatArray) -> FloatArray:
+    """Each camera's own covariance out of the joint one. (6 N, 6 N) -> (N, 6, 6)."""
+    cameras = np.arange(len(joint) // 6)
+    return np.asarray(joint.reshape(len(cameras), 6, len(cameras), 6)[cameras, :, cameras])
+
+
+def rows_of(cameras: Sequence[int], count: int = 6) -> IntArray:
+    """Where the first ``count`` numbers of some cameras stand in a joint covariance. -> (count K,)."""
+    return (6 * np.asarray(cameras, int)[:, None] + np.arange(count)).reshape(-1)
+
+
 def place(
-    centres: FloatArray, covariances: FloatArray, baselines: Sequence[Baseline]
+    centres: FloatArray, joint: FloatArray, baselines: Sequence[Baseline]
 ) -> tuple[FloatArray, FloatArray]:
     """The centres that suit both what was known of each and the directions between them.
 
     Linear least squares on the part of each difference of centres that is across its direction, reweighted by
-    distance and, as Cauchy's loss has it, by how well it fits. What the covariances say of the rotations
+    distance and, as Cauchy's loss has it, by how well it fits. What the covariance says of the rotations
     follows from how they go along with the positions.
 
     Args:
         centres: (N, 3) known before, object frame.
-        covariances: (N, 6, 6) of position and rotation, as `relpose_ros.estimates.CameraPose` has them.
+        joint: (6 N, 6 N) covariance of position and rotation, for each camera as
+            `relpose_ros.estimates.CameraPose` has it.
         baselines: May be few, or contradict each other.
 
     Returns:
-        (N, 3) and (N, 6, 6).
+        (N, 3) and (6 N, 6 N).
     """
     if not baselines:
-        return centres, covariances
-    count = len(centres)
-    prior = np.zeros((3 * count, 3 * count))
-    for camera in range(count):
-        block = slice(3 * camera, 3 * camera + 3)
-        prior[block, block] = np.linalg.inv(covariances[camera, :3, :3])
+        return centres, joint
+    rows = rows_of(range(len(centres)), 3)
+    prior = np.linalg.inv(joint[np.ix_(rows, rows)])
     target = prior @ centres.reshape(-1)
     found = centres
     for _ in range(ROUNDS):
@@ -87,12 +105,9 @@ def place(
         for each in baselines:
             information += _information(each, found)
         found = np.linalg.solve(information, target).reshape(-1, 3)
-    spread = np.linalg.inv(information)
-    updated = covariances.copy()
-    for camera in range(count):
-        block = slice(3 * camera, 3 * camera + 3)
-        updated[camera] = _conditioned(covariances[camera], spread[block, block])
-    return found, updated
+    gain = joint[:, rows] @ prior
+    updated = joint + gain @ (np.linalg.inv(information) - joint[np.ix_(rows, rows)]) @ gain.T
+    return found, (updated + updated.T) / 2
 
 
 def _information(each: Baseline, centres: FloatArray) -> FloatArray:
@@ -115,14 +130,3 @@ def _information(each: Baseline, centres: FloatArray) -> FloatArray:
     jacobian[:, 3 * each.i : 3 * each.i + 3] = -np.eye(3)
     jacobian[:, 3 * each.j : 3 * each.j + 3] = np.eye(3)
     return np.asarray(jacobian.T @ weight @ jacobian)
-
-
-def _conditioned(covariance: FloatArray, position: FloatArray) -> FloatArray:
-    """A pose's covariance once its position is known to ``position`` (3, 3). (6, 6) -> (6, 6)."""
-    gain = np.linalg.solve(covariance[:3, :3], covariance[:3, 3:]).T  # rotation per position
-    updated = covariance.copy()
-    updated[:3, :3] = position
-    updated[3:, :3] = gain @ position
-    updated[:3, 3:] = updated[3:, :3].T
-    updated[3:, 3:] += gain @ (position - covariance[:3, :3]) @ gain.T
-    return np.asarray((updated + updated.T) / 2)

@@ -17,13 +17,15 @@ from relpose_ros.estimates import CameraPose, ScanEstimate, Verdict
 from relpose_ros.geometry import cameras, so3_grid
 from relpose_ros.inference import bundle_adjustment
 from relpose_ros.inference.calibration import Calibration
-from relpose_ros.inference.camera_positions import baseline, place
+from relpose_ros.inference.camera_positions import apart, baseline, joined, place, rows_of
 from relpose_ros.inference.evidence import SHIPPED, EvidenceSettings
 from relpose_ros.inference.global_rotations import joint_scores, solve
 from relpose_ros.inference.matches import Matcher, peaks
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import COARSE_LEVEL, GridEmbeddings, PairEnergies
 from relpose_ros.inference.predictions import predicted_translations, regressed_poses
+from relpose_ros.inference.refined_poses import settle
+from relpose_ros.inference.robot_frame import RobotFrame, find_robot_frame
 from relpose_ros.inference.rotation_evidence import RotationEvidence
 from relpose_ros.inference.uncertainty import (
     camera_covariances,
@@ -38,11 +40,13 @@ from relpose_ros.network.features import ViewFeatures
 from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     import numpy.typing as npt
 
     from relpose_ros.estimates import PairRotation
+    from relpose_ros.inference.camera_positions import Baseline
     from relpose_ros.inference.matches import TwoViewGeometry
     from relpose_ros.inference.pair_distribution import PairDistributions
     from relpose_ros.network.features import SceneFeatures
@@ -88,8 +92,8 @@ class _Told:
     """(N, 3, 3) camera_from_object."""
     centres: FloatArray
     """(N, 3)."""
-    covariances: FloatArray
-    """(N, 6, 6)."""
+    joint: FloatArray
+    """(6 N, 6 N) their covariance, as `camera_positions.joined` orders it."""
     pairs: tuple[PairRotation, ...]
     score: float
     verdict: tuple[Verdict, int, str]
@@ -189,25 +193,34 @@ class Estimator:
         with self._lock:
             start = time.perf_counter()
             told = self._regressed(scan) if self._regresses else self._solved(scan)
-            unit = self._evidence.first_view_distance or 1.0
-            covariances = told.covariances.copy()
-            covariances[:, :3] *= unit
-            covariances[:, :, :3] *= unit
+            rotations = told.rotations
+            robot: RobotFrame | str = ""
+            if scan.robot_poses:
+                robot = find_robot_frame(rotations, told.centres, told.joint, scan.robot_poses)
+            in_robot = robot if isinstance(robot, RobotFrame) else None
+            unit, deviation = self._evidence.first_view_distance or 1.0, 0.0
+            if in_robot is not None:
+                unit, deviation = in_robot.scale, in_robot.deviation
+            centres, covariances = _scaled(told.centres, apart(told.joint), unit, deviation)
             verdict, weakest, status = told.verdict
+            if isinstance(robot, str) and robot:
+                status += f" (the robot's camera poses do not tell the scale: {robot})"
             return ScanEstimate(
                 object_id=scan.object_id,
                 cameras=tuple(
-                    CameraPose(view, told.rotations[view].T, unit * told.centres[view], covariances[view])
+                    CameraPose(view, rotations[view].T, centres[view], covariances[view])
                     for view in range(len(scan.views))
                 ),
                 pairs=told.pairs,
                 score=told.score,
-                scale_known=self._evidence.first_view_distance > 0,
+                scale_known=in_robot is not None or self._evidence.first_view_distance > 0,
                 calibrated=self._calibration is not None,
                 verdict=verdict,
                 weakest_pair=weakest,
                 status=status,
                 seconds=time.perf_counter() - start,
+                scale_deviation=deviation,
+                object_pose=None if in_robot is None else in_robot.object_pose,
             )
 
     @torch.no_grad()
@@ -243,18 +256,16 @@ class Estimator:
         covariances = camera_covariances(
             found.distributions, found.energies, solution, translations, found.calibration
         )
-        rotations, centres, covariances = self._place(
-            scan, found, solution.numpy(), translations, covariances
-        )
+        rotations, centres, joint = self._place(scan, found, solution.numpy(), translations, covariances)
         solution = torch.from_numpy(rotations)
         pairs = describe_pairs(found.distributions, found.energies, solution, found.calibration)
         return _Told(
             rotations,
             centres,
-            covariances,
+            joint,
             pairs,
             score=float(joint_scores(found.energies, solution[None])[0]),
-            verdict=judge(pairs, covariances, self._calibration is not None),
+            verdict=judge(pairs, apart(joint), self._calibration is not None),
         )
 
     def _regressed(self, scan: Scan) -> _Told:
@@ -263,7 +274,7 @@ class Estimator:
         return _Told(
             rotations,
             cameras.camera_centre(rotations, translations),
-            covariances_of_unknown_trust(rotations, translations, Calibration()),
+            joined(covariances_of_unknown_trust(rotations, translations, Calibration())),
             pairs_of_unknown_trust(rotations),
             score=0.0,
             verdict=(Verdict.ONE_MORE_VIEW, 0, WITHOUT_PROBABILITIES),
@@ -302,18 +313,28 @@ class Estimator:
         translations: FloatArray,
         covariances: FloatArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Rotations, camera centres and covariances with what the matches say of positions."""
-        centres = cameras.camera_centre(rotations, translations)
-        baselines = []
-        for (i, j), geometry in found.geometries.items():
-            if geometry.agrees(rotations[j] @ rotations[i].T):
-                pose, turn = geometry.poses[0], covariances[j, 3:, 3:]
-                baselines.append(
-                    baseline(i, j, rotations[j], pose.direction, pose.direction_covariance, turn)
-                )
-        centres, covariances = place(centres, covariances, baselines)
+        """Rotations, camera centres and their joint covariance with what the matches say of positions."""
+        centres, joint = cameras.camera_centre(rotations, translations), joined(covariances)
+        baselines = _baselines(found.geometries, rotations, covariances)
+        placed, placed_joint = place(centres, joint, baselines)
+        refined = self._refine(scan, found, rotations, placed)
+        if refined is None:
+            return rotations, placed, placed_joint
+        settled, settled_joint = settle(refined, placed_joint)
+        others = [camera for camera in range(len(rotations)) if camera not in refined.moved]
+        # The directions between cameras that moved are told already, and better.
+        left = [each for each in baselines if each.i in others or each.j in others]
+        settled[others] = centres[others]
+        rows = rows_of(others)
+        settled_joint[np.ix_(rows, rows)] = joint[np.ix_(rows, rows)]
+        return refined.rotations, *place(settled, settled_joint, left)
+
+    def _refine(
+        self, scan: Scan, found: _Found, rotations: FloatArray, centres: FloatArray
+    ) -> bundle_adjustment.Refined | None:
+        """What a bundle adjustment makes of the poses, where it improves them."""
         if self._matcher is None or self._evidence.use != "refine":
-            return rotations, centres, covariances
+            return None
         refined = bundle_adjustment.refine(
             rotations,
             cameras.translation_of(rotations, centres),
@@ -321,12 +342,10 @@ class Estimator:
             found.geometries,
         )
         if refined is None:
-            return rotations, centres, covariances
+            return None
         both = torch.from_numpy(np.stack([rotations, refined.rotations]))
         before, after = joint_scores(found.energies, both).tolist()
-        if after < before - CONTRADICTION * found.energies.count:
-            return rotations, centres, covariances
-        return refined.rotations, cameras.camera_centre(refined.rotations, refined.translations), covariances
+        return None if after < before - CONTRADICTION * found.energies.count else refined
 
     def _features(self, scan: Scan) -> SceneFeatures:
         looks = []
@@ -343,3 +362,27 @@ class Estimator:
     def _matcher_of(self, evidence: EvidenceSettings) -> Matcher | None:
         alone = self._regresses or evidence.use == "network"
         return None if alone else Matcher(surroundings=evidence.surroundings)
+
+
+def _baselines(
+    geometries: Mapping[tuple[int, int], TwoViewGeometry], rotations: FloatArray, covariances: FloatArray
+) -> list[Baseline]:
+    """The directions between cameras by those pairs' matches that agree with their rotations."""
+    return [
+        baseline(
+            *(i, j, rotations[j], geometry.poses[0].direction, geometry.poses[0].direction_covariance),
+            covariances[j, 3:, 3:],
+        )
+        for (i, j), geometry in geometries.items()
+        if geometry.agrees(rotations[j] @ rotations[i].T)
+    ]
+
+
+def _scaled(
+    centres: FloatArray, covariances: FloatArray, unit: float, deviation: float
+) -> tuple[FloatArray, FloatArray]:
+    """Centres (N, 3) and covariances (N, 6, 6) in another unit, itself known to a relative deviation."""
+    centres, scale = unit * centres, np.repeat([unit, 1.0], 3)
+    covariances = scale[:, None] * covariances * scale
+    covariances[:, :3, :3] += deviation**2 * centres[:, :, None] * centres[:, None, :]
+    return centres, covariances

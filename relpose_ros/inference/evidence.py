@@ -18,7 +18,8 @@ class EvidenceSettings:
     learned: bool = True
     """Whether the network's rotations take part: False measures what the geometry alone can do."""
     first_view_distance: float = 0.0
-    """Metres from the first camera to the object frame's origin; 0: not known, and neither is the scale."""
+    """Metres from the first camera to the object frame's origin; 0: not known. A scan whose robot poses tell
+    the scale needs none."""
 
 
 SHIPPED = EvidenceSettings()

@@ -29,6 +29,13 @@ CONTRADICTION = math.radians(10)
 """From this angle on between a pair's own rotation and the final poses' the two disagree."""
 LARGEST_DEVIATION = math.radians(12)
 """Largest standard deviation (worst axis) of a camera's rotation: within 15 degrees more often than not."""
+ONE_MORE = "one more view: "
+WITHOUT_ROOM = {
+    "first": "drop_last_view makes room for another one, reset for all",
+    "latest": "the next one takes the place of the oldest",
+    "spread": "the next one from a new direction takes the place of the view that tells least",
+}
+"""What to do instead of one more view where no more are held, by the scan's policy of which ones stay."""
 
 
 WITHOUT_PROBABILITIES = (
@@ -61,7 +68,7 @@ def judge(
         camera = int(ties.argmin())
         own = [p for p, pair in enumerate(pairs) if camera in (pair.i, pair.j) and pair in trusted]
         reason = f"view {camera} hangs on one pair, which no other pair checks"
-        return Verdict.ONE_MORE_VIEW, own[0], f"one more view: {reason}"
+        return Verdict.ONE_MORE_VIEW, own[0], f"{ONE_MORE}{reason}"
     if all(tied) and deviations.max() <= LARGEST_DEVIATION:
         weakest = min(range(len(pairs)), key=lambda p: _certainty(pairs[p]))
         if calibrated:
@@ -72,7 +79,7 @@ def judge(
                 f"enough: {len(trusted)} of {len(pairs)} pairs agree, rotations to about {worst:.0f} degrees",
             )
         reason = "these weights are not calibrated, so that none of their estimates can be called enough"
-        return Verdict.ONE_MORE_VIEW, weakest, f"one more view: {reason}"
+        return Verdict.ONE_MORE_VIEW, weakest, f"not enough: {reason}"
     loose = [camera for camera, is_tied in enumerate(tied) if not is_tied] or [int(deviations.argmax())]
     # Not the pair that knows least, which may be of two views that show opposite sides: the weak link of the
     # best chain is what a further view between the two would mend.
@@ -86,7 +93,18 @@ def judge(
         reason = (
             f"rotations are known to about {worst:.0f} degrees only, the weak link is pair {pair.i}-{pair.j}"
         )
-    return Verdict.ONE_MORE_VIEW, weakest, f"one more view: {reason}"
+    return Verdict.ONE_MORE_VIEW, weakest, f"{ONE_MORE}{reason}"
+
+
+def without_room(words: str, keep: str) -> str:
+    """A verdict in words where the scan holds as many views as it may.
+
+    Args:
+        words: As `judge` says them.
+        keep: Which views stay: a key of ``WITHOUT_ROOM``.
+    """
+    reason = words.removeprefix(ONE_MORE)
+    return words if reason == words else f"no room for one more view: {reason}; {WITHOUT_ROOM[keep]}"
 
 
 def _certainty(pair: PairRotation) -> float:

@@ -18,7 +18,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, JumpThreshold
@@ -75,9 +75,11 @@ INPUTS: tuple[tuple[Kind, str, Any, str], ...] = (
     ("object_view", "object_view", ObjectView, ""),
     ("image", "image", Image, "raw"),
     ("compressed", "image/compressed", CompressedImage, "compressed"),
+    ("camera_info", "camera_info", CameraInfo, ""),
+    ("camera_pose", "camera_pose", PoseStamped, ""),
+    ("camera_pose", "camera_pose_with_covariance", PoseWithCovarianceStamped, ""),
 )
 """Kind, topic, type, and the image transport that must be asked for (empty: always there)."""
-CAMERA_INFO: tuple[Kind, str, Any] = ("camera_info", "camera_info", CameraInfo)
 
 OUTPUTS: tuple[tuple[str, Any], ...] = (
     ("~/estimate", ScanEstimate),
@@ -307,8 +309,9 @@ class ScanNode(LifecycleNode):
 
     def _make_inputs(self, scanner: Scanner) -> None:
         transports = self._settings.image_transports
-        wanted = [each[:3] for each in INPUTS if not each[3] or each[3] in transports]
-        for kind, name, message_type in [*wanted, CAMERA_INFO]:
+        for kind, name, message_type, transport in INPUTS:
+            if transport and transport not in transports:
+                continue
             topic = self.resolve_topic_name(name)
             events = SubscriptionEventCallbacks(
                 incompatible_qos=functools.partial(self._on_incompatible_qos, topic, True),
@@ -503,7 +506,7 @@ class ScanNode(LifecycleNode):
     # Parameters.
 
     def _tell_unknown_parameters(self) -> list[str]:
-        subscribed = {self.resolve_topic_name(each[1]) for each in (*INPUTS, CAMERA_INFO)}
+        subscribed = {self.resolve_topic_name(each[1]) for each in INPUTS}
         published = {self.resolve_topic_name(each[0]) for each in OUTPUTS} | {DIAGNOSTICS_TOPIC}
         overridable = [
             f"qos_overrides.{topic}.{end}.{policy.name.lower()}"
@@ -559,7 +562,7 @@ class ScanNode(LifecycleNode):
     def _advice_on_topics(self, statistics: Statistics | None) -> list[str]:
         """About what no single message shows."""
         advice = []
-        estimates, infos = self.resolve_topic_name(OUTPUTS[0][0]), self.resolve_topic_name(CAMERA_INFO[1])
+        estimates, infos = self.resolve_topic_name(OUTPUTS[0][0]), self.resolve_topic_name("camera_info")
         if self.count_publishers(estimates) > 1:
             advice.append(twin_advice(estimates))
         if statistics is not None and (statistics.unpaired_s or 0.0) > UNPAIRED_AFTER_S:

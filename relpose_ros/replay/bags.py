@@ -58,6 +58,13 @@ IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE_STAMPED = "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+CAMERA_POSE_TOPICS = {
+    "camera_pose": POSE_STAMPED,
+    "camera_pose_with_covariance": POSE_WITH_COVARIANCE_STAMPED,
+}
+"""The node's own names and types."""
 
 UNKNOWN_HASH = "RIHS01_" + "0" * 64
 """The writer insists on a type hash, an MCAP file has none."""
@@ -386,7 +393,9 @@ def choose_inputs(bag: BagReader, wanted: Sequence[str] = ()) -> dict[str, Input
     """Which topics of a bag feed the scanner, and as what.
 
     Without ``wanted``: all ObjectView topics, else the one camera that the bag holds, raw before
-    compressed. The camera info is looked for beside the image topic, as image_transport places it.
+    compressed. The camera info is looked for beside the image topic, as image_transport places it, and so
+    are the robot's camera poses; where there are none beside it, those of the bag count if they are of one
+    camera.
 
     Args:
         bag: An open bag.
@@ -422,6 +431,8 @@ def choose_inputs(bag: BagReader, wanted: Sequence[str] = ()) -> dict[str, Input
             )
             raise BagError(text)
         inputs[info] = Input("camera_info", camera)
+    for topic in _camera_poses_of(chosen, topics):
+        inputs[topic] = Input("camera_pose", "")
     return inputs
 
 
@@ -520,6 +531,17 @@ def _camera_info_of(bag: BagReader, image_topic: str, topics: dict[str, str]) ->
         "object's box is; record it too (its roi is the box, an empty one the whole image), or ObjectView."
     )
     raise BagError(text)
+
+
+def _camera_poses_of(images: Sequence[str], topics: dict[str, str]) -> list[str]:
+    poses = [
+        topic for topic, kind in topics.items() if CAMERA_POSE_TOPICS.get(topic.rpartition("/")[2]) == kind
+    ]
+    places = {_camera_of(image).rpartition("/")[0] for image in images}
+    beside = [topic for topic in poses if topic.rpartition("/")[0] in places]
+    if beside:
+        return beside
+    return poses if len({topic.rpartition("/")[0] for topic in poses}) == 1 else []
 
 
 def _default_images(bag: BagReader, topics: dict[str, str]) -> list[str]:

@@ -29,7 +29,7 @@ from relpose_ros.scanning.settings import ScanSettings
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from relpose_ros.estimates import CameraPose, FloatArray, Mode, PairRotation
+    from relpose_ros.estimates import CameraPose, FloatArray, Mode, ObjectPose, PairRotation
     from relpose_ros.replay.comparison import TruePose
     from relpose_ros.replay.recording import EstimateRecord, ViewRecord
     from relpose_ros.scanning.scanner import SupportsEstimate
@@ -118,6 +118,13 @@ def replay(
                         recording.add(result, record.log_time_ns)
                         progress.set_postfix_str(result.estimate.status[:60], refresh=False)
                 progress.update()
+    for topic, entry in inputs.items():
+        counts = scanner.statistics().topics.get(topic)
+        if entry.kind == "camera_pose" and counts is not None and not counts.used:
+            text = (
+                "None of the %d camera poses on %s has the stamp of a view: they tell nothing of the scale."
+            )
+            logger.warning(text, counts.received, topic)
     rejected = [(examples[reason], count) for reason, count in rejections.most_common()]
     for topic, count in sorted(reader.unreadable.items()):
         rejected.append((f"{topic}: the message is not what its type says.", count))
@@ -256,9 +263,20 @@ def _estimate_json(record: EstimateRecord) -> dict[str, Any]:
     return {
         "views": list(record.views),
         "scale_known": bool(estimate.scale_known),
+        "scale_deviation": float(estimate.scale_deviation),
+        "object_pose": None if estimate.object_pose is None else _object_pose_json(estimate.object_pose),
         "status": estimate.status,
         "cameras": [_camera_json(camera) for camera in estimate.cameras],
         "pairs": [_pair_json(pair) for pair in estimate.pairs],
+    }
+
+
+def _object_pose_json(pose: ObjectPose) -> dict[str, Any]:
+    return {
+        "frame_id": pose.frame_id,
+        "position": _numbers(pose.position),
+        "orientation_xyzw": _numbers(so3.quaternion_xyzw(pose.robot_from_object)),
+        "covariance": _numbers(pose.covariance),
     }
 
 

@@ -142,7 +142,8 @@ def _facts(recording: Recording, last: EstimateRecord, comparison: Comparison | 
             typical = 100 * np.median(list(comparison.centre_errors.values()))
             facts.append(f"Camera centres are off by {typical:.0f} % of the scene's size (median).")
     if last.estimate.scale_known:
-        facts.append("Positions are in metres.")
+        deviation = 100 * last.estimate.scale_deviation
+        facts.append(f"Positions are in metres{f', their scale to {deviation:.0f} %' if deviation else ''}.")
     else:
         facts.append("The scale is unknown: the first camera is at distance 1 from the object.")
     if not last.estimate.calibrated:

@@ -18,21 +18,25 @@ from relpose_ros.errors import RelPoseError
 from relpose_ros.scanning import image_decoding
 from relpose_ros.scanning.image_decoding import ImageError, Region
 from relpose_ros.scanning.settings import MAX_NAME_LENGTH
-from relpose_ros.views import BoundingBox, Intrinsics, View
+from relpose_ros.views import BoundingBox, Intrinsics, RobotPose, View
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     import numpy.typing as npt
 
-Kind = Literal["object_view", "image", "compressed", "camera_info"]
-"""relpose_ros/ObjectView; sensor_msgs/Image, CompressedImage and CameraInfo."""
+Kind = Literal["object_view", "image", "compressed", "camera_info", "camera_pose"]
+"""relpose_ros/ObjectView; sensor_msgs/Image, CompressedImage and CameraInfo; geometry_msgs/PoseStamped or
+PoseWithCovarianceStamped."""
 
 MIN_BOX_SIDE = 8
 """Pixels: a smaller box shows nothing of an object that a network could use."""
 
 MAX_FULL_SIDE = 2**16
 """Pixels: a larger full image is garbage."""
+
+QUATERNION_TOLERANCE = 0.01
+"""How far from 1 a quaternion's length may be: rounded, not garbage."""
 
 _REGION_SCALE = 1.2
 """Part of the picture kept around a box, in units of its longer side: the network's crop is 1.15, and a
@@ -154,6 +158,44 @@ def view_from_image(image: Any, info: Any, source: Source) -> View:
             text = f"the picture has {_size_text(picture.size)} pixels: neither the {_size_text(full)} of "
             raise source.rejection(f"{text}camera_info nor the {box.width:.0f} x {box.height:.0f} of its roi")
         return _view(picture, origin, box, full, _intrinsics(info.k, source), None, source)
+
+
+def robot_pose(message: Any, source: Source, deviations: tuple[float, float]) -> RobotPose:
+    """The pose in a geometry_msgs/PoseStamped or PoseWithCovarianceStamped of a camera's optical frame.
+
+    Args:
+        message: Its frame_id names the robot's fixed frame.
+        source: Where it came from.
+        deviations: Standard deviations of position (m) and rotation (rad), for a pose without a covariance or
+            with one that is all zero.
+
+    Raises:
+        ViewError: It is no pose, or its covariance none.
+    """
+    from relpose_ros.geometry import so3  # it imports PyTorch, which takes a node's start seconds
+
+    if not source.frame_id:
+        raise source.rejection("frame_id is empty: it names the robot's frame in which the pose is")
+    stated = getattr(message.pose, "covariance", None)
+    pose = message.pose if stated is None else message.pose.pose
+    p, q = pose.position, pose.orientation
+    position, quaternion = np.array([p.x, p.y, p.z], float), np.array([q.x, q.y, q.z, q.w], float)
+    if not np.isfinite(position).all():
+        raise source.rejection(f"the position holds what is no number: {position.tolist()}")
+    length = float(np.linalg.norm(quaternion))
+    if not abs(length - 1) < QUATERNION_TOLERANCE:  # nan is refused too
+        text = f"the orientation {quaternion.tolist()} has length {length:.3g}: a rotation's quaternion has 1"
+        raise source.rejection(text)
+    covariance = np.zeros((6, 6)) if stated is None else np.array(stated, float).reshape(6, 6)
+    if not np.isfinite(covariance).all():
+        raise source.rejection("the covariance holds what is no number")
+    covariance = (covariance + covariance.T) / 2
+    if not covariance.any():
+        covariance = np.diag(np.repeat(np.square(deviations), 3))
+    elif float(np.linalg.eigvalsh(covariance)[0]) < -1e-9 * float(np.abs(covariance).max()):
+        text = f"the covariance with the diagonal {np.diag(covariance).tolist()} is none: it has a negative"
+        raise source.rejection(f"{text} eigenvalue; leave it all zero where it is unknown")
+    return RobotPose(source.frame_id, so3.from_quaternion_xyzw(quaternion), position, covariance)
 
 
 def _view(

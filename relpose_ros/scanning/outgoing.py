@@ -29,6 +29,7 @@ TYPE_NAMES = (
     "geometry_msgs/msg/Pose",
     "geometry_msgs/msg/PoseArray",
     "geometry_msgs/msg/PoseWithCovariance",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/Quaternion",
     "geometry_msgs/msg/Vector3",
     "relpose_ros/msg/CameraEstimate",
@@ -73,6 +74,8 @@ def estimate_message(
         pairs=[_pair(pair, types) for pair in estimate.pairs],
         score=float(estimate.score),
         scale_known=bool(estimate.scale_known),
+        scale_deviation=float(estimate.scale_deviation),
+        object_pose=_object_pose(estimate, scan, types),
         calibrated=bool(estimate.calibrated),
         verdict=int(estimate.verdict),
         weakest_pair=int(estimate.weakest_pair),
@@ -178,6 +181,22 @@ def _frustum(view: View, size: float) -> FloatArray:
     ends += [end for k in range(4) for end in (corners[k], corners[(k + 1) % 4])]
     ends += [corners[0], roof, roof, corners[1]]
     return np.stack(ends)
+
+
+def _object_pose(estimate: ScanEstimate, scan: Scan, types: MessageTypes) -> Any:
+    frame, position, rotation = "", np.zeros(3), np.eye(3)
+    covariance = np.zeros((6, 6))
+    covariance[0, 0] = -1.0  # what ROS's messages mean by "not known"
+    if estimate.object_pose is not None:
+        known = estimate.object_pose
+        frame, position, rotation = known.frame_id, known.position, known.robot_from_object
+        covariance = known.covariance
+    return types["geometry_msgs/msg/PoseWithCovarianceStamped"](
+        header=_scan_header(scan, types, frame),
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](
+            pose=_pose(types, position, rotation), covariance=_flat(covariance)
+        ),
+    )
 
 
 def _camera(camera: CameraPose, view: View, types: MessageTypes) -> Any:

@@ -88,6 +88,10 @@ class ScanBuffer:
         """The views held, oldest first, without those whose place is not decided yet."""
         return tuple(self._views)
 
+    def stamps(self) -> set[int]:
+        """Of the views held and of those whose place is not decided yet, ns."""
+        return {view.stamp_ns for view in self._all()}
+
     def declines(self, stamp_ns: int, frame_id: str, topic: str) -> Decision | None:
         """The answer to a view that would not be taken whatever it shows; None: show it.
 

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any, Protocol, get_args
 
 from relpose_ros.errors import RelPoseError
 from relpose_ros.estimates import Verdict
+from relpose_ros.inference.verdict import without_room
 from relpose_ros.scanning.incoming import (
     Arrival,
     Pairing,
     ViewError,
     object_id_of,
+    robot_pose,
     source_of,
     stamp_text,
     view_from_image,
@@ -23,6 +25,7 @@ from relpose_ros.scanning.incoming import (
 from relpose_ros.scanning.incoming import (
     Kind as Kind,  # a word of this module's interface
 )
+from relpose_ros.scanning.robot_poses import RobotPoses
 from relpose_ros.scanning.scan_buffer import ScanBuffer
 from relpose_ros.views import MIN_VIEWS, Scan
 
@@ -49,7 +52,7 @@ class Receipt:
     """What became of a message."""
 
     accepted: bool
-    """Whether a view of it is held now."""
+    """Whether a view of it is held now, or one to which it gives a camera pose."""
     object_id: str
     """Whose view it was; empty where no view came of it (yet)."""
     reason: str
@@ -77,7 +80,7 @@ class TopicStatistics:
 
     received: int
     used: int
-    """Messages of which a view came (an image and its camera info count both)."""
+    """Messages of which a view came (an image and its camera info count both), or its camera pose."""
     rejected: int
     last_reason: str
     """Why the last rejected message was rejected; empty where none was."""
@@ -145,6 +148,7 @@ class Scanner:
         self._receiving = threading.Lock()
         self._state = threading.Lock()
         self._pairing = Pairing(settings.pairing_queue, round(settings.backward_jump_s * 1e9))
+        self._robot_poses = RobotPoses()
         self._scans: dict[str, _ScanState] = {}
         self._topics: dict[str, _TopicState] = {}
         self._taken_back: list[Result] = []
@@ -170,6 +174,8 @@ class Scanner:
             try:
                 if kind == "object_view":
                     return self._receive_object_view(topic, message)
+                if kind == "camera_pose":
+                    return self._receive_camera_pose(topic, message)
                 return self._receive_half(kind, topic, message, camera)
             except ViewError as err:
                 return self._rejected(topic, "", str(err))
@@ -230,6 +236,7 @@ class Scanner:
                 forgotten += views
                 self._take_back(state, state.buffer.views, f"no view is left: {reason}")
                 _logger.info("The scan of %r with %d views is forgotten: %s.", each, views, reason)
+            self._robot_poses.forget(self._stamps_held())
             return forgotten
 
     def drop_last_view(self, object_id: str | None = None) -> Receipt:
@@ -292,6 +299,32 @@ class Scanner:
         object_id = object_id_of(message, source, self._settings.object_id)
         return self._offer(object_id, source, lambda: view_from_object_view(message, source), (topic,))
 
+    def _receive_camera_pose(self, topic: str, message: Any) -> Receipt:
+        source = source_of(message, topic)
+        settings = self._settings
+        deviations = settings.camera_pose_position_deviation, settings.camera_pose_rotation_deviation
+        pose = robot_pose(message, source, deviations)
+        with self._state:
+            news, gone = self._robot_poses.put(source, pose, self._stamps_held())
+            for unknown in gone:
+                text = "no view has this stamp: a camera's pose takes the stamp of the image"
+                self._count_rejected(unknown.topic, str(unknown.rejection(text)))
+            states = [state for state in self._scans.values() if source.stamp_ns in state.buffer.stamps()]
+            if not news or not states:
+                return Receipt(False, "", "")
+            self._claim_robot_pose(source.stamp_ns)
+            for state in states:
+                state.buffer.require_work()
+            return Receipt(True, states[-1].buffer.object_id, "")
+
+    def _claim_robot_pose(self, stamp_ns: int) -> None:
+        source = self._robot_poses.claim(stamp_ns)
+        if source is not None:
+            self._topics[source.topic].used += 1
+
+    def _stamps_held(self) -> set[int]:
+        return set().union(*(state.buffer.stamps() for state in self._scans.values()))
+
     def _receive_half(self, kind: Kind, topic: str, message: Any, camera: str) -> Receipt:
         source = source_of(message, topic)
         receipts = [
@@ -339,6 +372,7 @@ class Scanner:
                     self._scans[object_id] = self._scans.pop(object_id)
                     for topic in topics:
                         self._topics[topic].used += 1
+                    self._claim_robot_pose(view.stamp_ns)
                     text = str(source.rejection(decision.reason)) if decision.reason else ""
                     return Receipt(True, object_id, text)
         text = str(source.rejection(decision.reason))
@@ -369,6 +403,8 @@ class Scanner:
                 pairs=(),
                 score=0.0,
                 scale_known=False,
+                scale_deviation=0.0,
+                object_pose=None,
                 verdict=Verdict.ONE_MORE_VIEW,
                 weakest_pair=0,
                 status=status,
@@ -379,9 +415,12 @@ class Scanner:
 
     def _rejected(self, topic: str, object_id: str, reason: str) -> Receipt:
         with self._state:
-            self._topics[topic].rejected += 1
-            self._topics[topic].last_reason = reason
+            self._count_rejected(topic, reason)
         return Receipt(False, object_id, reason, rejected=True)
+
+    def _count_rejected(self, topic: str, reason: str) -> None:
+        self._topics[topic].rejected += 1
+        self._topics[topic].last_reason = reason
 
     def _estimate(self, states: list[_ScanState]) -> list[Result]:
         """One estimate of each scan; the state is free while the estimator runs."""
@@ -389,11 +428,15 @@ class Scanner:
         for state in states:
             with self._state:
                 work, arrived = state.buffer.work(), state.arrived
-            if work is None:
-                continue
-            scan = Scan(state.buffer.object_id, work.views)
+                if work is None:
+                    continue
+                poses = self._robot_poses.of(work.views)
+            scan = Scan(state.buffer.object_id, work.views, poses)
             try:
                 estimate = self._estimator.estimate(scan)
+                if len(scan.views) >= self._settings.max_views:
+                    words = without_room(estimate.status, self._settings.keep)
+                    estimate = replace(estimate, status=words)
             except Exception as err:
                 text = f"The estimate of {scan.object_id!r} from {len(scan.views)} views failed: {err}."
                 # A sentence for the user needs no traceback, a defect does.

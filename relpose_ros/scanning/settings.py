@@ -129,8 +129,21 @@ class ScanSettings:
     first_view_distance: float = _setting(
         0.0,
         "Distance in metres from the first camera to the object, for positions in metres; 0: not known, and "
-        "the distance is the unit of length.",
+        "the distance is the unit of length. Where the robot's camera poses tell the scale, they go before "
+        "it.",
         limits=(0.0, 1000.0),
+    )
+    camera_pose_position_deviation: float = _setting(
+        0.005,
+        "Standard deviation in metres, each axis, of the robot's camera poses where they come without a "
+        "covariance: of the arm or the localisation together with the hand-eye calibration.",
+        limits=(1e-6, 100.0),
+    )
+    camera_pose_rotation_deviation: float = _setting(
+        0.01,
+        "Standard deviation in rad, about each axis, of the robot's camera poses where they come without a "
+        "covariance.",
+        limits=(1e-6, 3.0),
     )
     threads: int = _setting(
         0,

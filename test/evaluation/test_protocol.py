@@ -8,12 +8,13 @@ import pytest
 
 from relpose_ros.captures.folder import Frame, save_capture
 from relpose_ros.evaluation import protocol
-from relpose_ros.evaluation.baselines import ConstantTranslation, Estimated, Identity, Poses
+from relpose_ros.evaluation.baselines import ConstantTranslation, Estimated, Identity, Known, Poses
 from relpose_ros.evaluation.metrics import rotation_errors
 from relpose_ros.evaluation.protocol import EvaluationError, PosedViews
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import look_at, translation_of
 from relpose_ros.inference.estimator import Estimator
+from relpose_ros.inference.verdict import LARGEST_DEVIATION
 from relpose_ros.network.checkpoint import random_network, write_network
 from relpose_ros.network.presets import named_preset
 from relpose_ros.views import BoundingBox, View
@@ -85,6 +86,26 @@ def test_constant_translation_keeps_the_rotations_and_suits_cameras_that_look_at
     partial = ConstantTranslation(Oracle(sequence, fails_from=2)).poses([sequence.view(k) for k in range(3)])
     assert np.isnan(partial.translations[2]).all()
     assert np.isfinite(partial.translations[:2]).all()
+
+
+def test_cameras_that_are_called_unknown_are_left_out_as_colmap_leaves_out_its_own():
+    """One wrong camera of five spoils the alignment of all, unless it is known to be unknown."""
+    sequence = posed()
+
+    class OneWrong:
+        name = "one-wrong"
+
+        def poses(self, views):
+            poses = Oracle(sequence).poses(views)
+            translations = poses.translations.copy()
+            translations[2] *= -3
+            deviations = np.where(np.arange(len(views)) == 2, 2 * LARGEST_DEVIATION, 0.01)
+            return Poses(poses.rotations, translations, deviations)
+
+    whole, known = protocol.measure(sequence, [OneWrong(), Known("known", OneWrong())], [5], orders=2)
+    assert whole["center@0.1"] < 0.3
+    assert known["center@0.1"] == pytest.approx(4 / 5)
+    assert known["rotation@5"] == pytest.approx(12 / 20)
 
 
 def test_the_identity_is_right_only_for_near_neighbours():

@@ -227,3 +227,30 @@ def test_the_jacobian_is_that_of_the_residuals(point_scene):
         np.testing.assert_allclose(
             jacobian[:, column], slope, rtol=1e-5, atol=1e-4 * max(1, np.abs(slope).max())
         )
+
+
+def test_the_points_say_nothing_of_where_all_cameras_are_and_of_their_unit(point_scene):
+    scene = point_scene.ring(ANGLES)
+    features = scene.features()
+    found = refine(*perturbed(scene), features, geometries(scene, features))
+    eigenvalues = np.linalg.eigvalsh(found.information)
+    assert found.information.shape == (24, 24)
+    np.testing.assert_allclose(found.information, found.information.T, rtol=1e-6, atol=1e-3)
+    assert np.abs(eigenvalues[:7]).max() < 1e-5 * eigenvalues[7]
+
+
+def test_errors_are_as_large_as_the_information_says(point_scene):
+    """Features that err each for themselves: squared deviations of three numbers are three on average."""
+    squares = []
+    for seed in range(8):
+        scene = point_scene.ring(ANGLES, seed=seed)
+        features = scene.features(noise=1.0, seed=seed)
+        found = refine(*perturbed(scene, 0.5, 0.01, seed), features, geometries(scene, features))
+        # The first camera held, and the unit of length by a weak hold on the others' translations.
+        held = found.information[6:, 6:] + np.diag(np.tile([0, 0, 0, 4.0, 4.0, 4.0], len(ANGLES) - 1))
+        covariance = np.linalg.inv(held)
+        for camera in range(1, len(ANGLES)):
+            own = slice(6 * camera - 6, 6 * camera - 3)
+            error = so3.log(scene.rotations[camera] @ found.rotations[camera].T)
+            squares.append(error @ np.linalg.solve(covariance[own, own], error))
+    assert 1.5 < np.mean(squares) < 5

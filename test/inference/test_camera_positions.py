@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from relpose_ros.geometry import cameras, so3
-from relpose_ros.inference.camera_positions import Baseline, baseline, place
+from relpose_ros.inference.camera_positions import Baseline, apart, baseline, joined, place
 
 LOOSE, EXACT, TURN = 0.2, math.radians(1), math.radians(5)
 
@@ -62,17 +62,25 @@ def shape_error(found, truth):
 
 def test_without_directions_nothing_changes():
     rotations, centres = around(3, 0)
-    covariances = prior(rotations)
-    found, updated = place(centres, covariances, [])
+    joint = joined(prior(rotations))
+    found, updated = place(centres, joint, [])
     np.testing.assert_array_equal(found, centres)
-    np.testing.assert_array_equal(updated, covariances)
+    np.testing.assert_array_equal(updated, joint)
+
+
+def test_cameras_are_joined_and_taken_apart():
+    covariances = prior(around(3, 0)[0])
+    joint = joined(covariances)
+    np.testing.assert_array_equal(apart(joint), covariances)
+    np.testing.assert_array_equal(joint, joint.T)
+    np.testing.assert_array_equal(joint[6:12, 12:], 0)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_exact_directions_recover_the_shape(seed):
     rotations, centres = around(5, seed)
     start = moved(centres, seed)
-    found, _ = place(start, prior(rotations), all_baselines(rotations, centres))
+    found, _ = place(start, joined(prior(rotations)), all_baselines(rotations, centres))
     assert shape_error(start, centres) > 0.08
     assert shape_error(found, centres) < 0.03
     np.testing.assert_allclose(found[0], centres[0], atol=0.01)
@@ -80,7 +88,7 @@ def test_exact_directions_recover_the_shape(seed):
 
 def test_directions_that_agree_change_no_position():
     rotations, centres = around(4, 1)
-    found, _ = place(centres, prior(rotations), all_baselines(rotations, centres))
+    found, _ = place(centres, joined(prior(rotations)), all_baselines(rotations, centres))
     np.testing.assert_allclose(found, centres, atol=1e-9)
 
 
@@ -91,7 +99,7 @@ def test_one_wrong_direction_is_outvoted(backwards):
     wrong = baselines[4]
     turned = -wrong.direction if backwards else so3.exp([0.9, -0.6, 0.4]) @ wrong.direction
     baselines[4] = Baseline(wrong.i, wrong.j, turned, wrong.covariance)
-    found, _ = place(moved(centres, 2), prior(rotations), baselines)
+    found, _ = place(moved(centres, 2), joined(prior(rotations)), baselines)
     assert shape_error(found, centres) < 0.04
 
 
@@ -99,7 +107,7 @@ def test_vague_directions_hardly_move_well_known_positions():
     rotations, centres = around(4, 3)
     start = moved(centres, 3, 0.05)
     vague = all_baselines(rotations, centres, deviation=math.radians(40))
-    found, _ = place(start, prior(rotations, shift=0.02), vague)
+    found, _ = place(start, joined(prior(rotations, shift=0.02)), vague)
     assert np.linalg.norm(found - start, axis=1).max() < 0.01
 
 
@@ -107,7 +115,10 @@ def test_covariances_shrink_across_the_directions_and_stay_covariances():
     rotations, centres = around(4, 4)
     before = prior(rotations)
     baselines = all_baselines(rotations, centres)
-    _, after = place(moved(centres, 4, 0.02), before, baselines)
+    _, joint = place(moved(centres, 4, 0.02), joined(before), baselines)
+    np.testing.assert_array_equal(joint, joint.T)
+    assert np.linalg.eigvalsh(joint).min() > 0
+    after = apart(joint)
     for old, new in zip(before, after, strict=True):
         np.testing.assert_array_equal(new, new.T)
         assert np.linalg.eigvalsh(new).min() > 0
@@ -125,19 +136,22 @@ def test_of_two_cameras_the_distance_stays_unknown():
     rotations, centres = around(2, 5)
     (only,) = all_baselines(rotations, centres)
     before = prior(rotations)
-    _, after = place(centres, before, [only])
-    along = only.direction @ after[1, :3, :3] @ only.direction
+    _, joint = place(centres, joined(before), [only])
+    along = only.direction @ apart(joint)[1, :3, :3] @ only.direction
     assert along == pytest.approx(LOOSE**2, rel=0.01)
 
 
 def test_a_direction_that_points_backwards_is_hardly_believed():
     rotations, centres = around(2, 5)
     (only,) = all_baselines(rotations, centres)
-    _, right = place(centres, prior(rotations), [only])
-    found, wrong = place(centres, prior(rotations), [Baseline(0, 1, -only.direction, only.covariance)])
+    _, right = place(centres, joined(prior(rotations)), [only])
+    found, wrong = place(
+        centres, joined(prior(rotations)), [Baseline(0, 1, -only.direction, only.covariance)]
+    )
     np.testing.assert_allclose(found, centres, atol=1e-6)
     across = np.eye(3) - np.outer(only.direction, only.direction)
-    assert np.trace(across @ wrong[1, :3, :3]) > 10 * np.trace(across @ right[1, :3, :3])
+    spread = [np.trace(across @ apart(joint)[1, :3, :3]) for joint in (wrong, right)]
+    assert spread[0] > 10 * spread[1]
 
 
 def test_a_baseline_points_from_the_first_centre_to_the_second():
@@ -164,6 +178,17 @@ def test_cameras_in_one_place_hold_nothing():
     rotations, _ = around(2, 7)
     centres = np.tile([0.0, 0.0, -1.0], (2, 1))
     direction = Baseline(0, 1, np.array([1.0, 0, 0]), EXACT**2 * np.diag([0.0, 1, 1]))
-    found, covariances = place(centres, prior(rotations), [direction])
+    found, covariances = place(centres, joined(prior(rotations)), [direction])
     np.testing.assert_allclose(found, centres, atol=1e-9)
     assert np.isfinite(covariances).all()
+
+
+def test_errors_of_cameras_with_a_direction_between_them_go_together():
+    rotations, centres = around(2, 5)
+    (only,) = all_baselines(rotations, centres)
+    _, joint = place(centres, joined(prior(rotations)), [only])
+    across = np.eye(3) - np.outer(only.direction, only.direction)
+    difference = joint[:3, :3] + joint[6:9, 6:9] - joint[:3, 6:9] - joint[6:9, :3]
+    length = np.linalg.norm(centres[1] - centres[0])
+    # Across the direction two axes: each is known to the direction's deviation times the length.
+    assert np.trace(across @ difference) == pytest.approx(2 * (EXACT * length) ** 2, rel=0.05)

@@ -17,7 +17,7 @@ from relpose_ros.inference.estimator import Estimator, EvidenceSettings, ScanErr
 from relpose_ros.inference.predictions import regressed_poses
 from relpose_ros.network.checkpoint import random_network, write_network
 from relpose_ros.network.presets import named_preset
-from relpose_ros.views import BoundingBox, Scan, View
+from relpose_ros.views import BoundingBox, RobotPose, Scan, View
 
 
 @pytest.fixture(scope="module")
@@ -339,7 +339,7 @@ def test_a_refinement_that_contradicts_the_pairs_is_not_taken(network, ball, of_
     def bent(rotations, translations, *rest):
         calls.append(rotations)
         turned = np.concatenate([rotations[:1], so3.exp([0, 0.4, 0]) @ rotations[1:]])
-        return Refined(turned, translations, (0, 1, 2), 5.0, 0.1)
+        return Refined(turned, translations, (0, 1, 2), 5.0, 0.1, np.eye(18))
 
     monkeypatch.setattr(bundle_adjustment, "refine", bent)
     refused = estimated(network, ball, use="refine")
@@ -423,6 +423,74 @@ def test_a_known_distance_gives_metres(of_ball, use):
         assert np.linalg.eigvalsh(b.covariance).min() > -1e-12
     assert plain.score == metric.score
     assert plain.verdict == metric.verdict
+
+
+METRES = 0.35
+"""From the camera to the ball: the unit of the ball's scene."""
+
+
+@pytest.fixture
+def robot_of_ball(rotation_of_ball):
+    """What a robot says of the cameras: as if they had moved, and the ball had stood still."""
+    robot_from_object = so3.exp([1.2, -0.4, 0.3])
+
+    def poses(deviation=0.002):
+        told = []
+        for turn in TURNS:
+            rotation = rotation_of_ball(turn) @ rotation_of_ball(TURNS[0]).T
+            centre = METRES * cameras.camera_centre(rotation, [0, 0, 1])
+            covariance = np.diag(np.repeat([deviation**2, 0.01**2], 3))
+            position = robot_from_object @ centre + [0.5, 0, 0.2]
+            told.append(RobotPose("base", robot_from_object @ rotation.T, position, covariance))
+        return tuple(told), robot_from_object
+
+    return poses
+
+
+def test_the_robots_camera_poses_give_metres_and_its_frame(network, ball, of_ball, robot_of_ball):
+    poses, robot_from_object = robot_of_ball()
+    plain = of_ball()
+    metric = estimated(network, Scan("ball", ball.views, poses))
+    assert metric.scale_known
+    assert 0 < metric.scale_deviation < 0.15
+    scale = np.linalg.norm(metric.cameras[0].position)
+    assert abs(math.log(scale / METRES)) < 3 * metric.scale_deviation
+    for a, b in zip(plain.cameras, metric.cameras, strict=True):
+        np.testing.assert_array_equal(a.object_from_camera, b.object_from_camera)
+        np.testing.assert_allclose(b.position, scale * a.position, rtol=1e-9)
+        # The scale's own deviation lies along the position.
+        alone = scale**2 * a.covariance[:3, :3]
+        along = metric.scale_deviation**2 * np.outer(b.position, b.position)
+        np.testing.assert_allclose(b.covariance[:3, :3], alone + along, rtol=1e-6, atol=1e-12)
+        np.testing.assert_array_equal(a.covariance[3:, 3:], b.covariance[3:, 3:])
+    known = metric.object_pose
+    assert known.frame_id == "base"
+    assert math.degrees(so3.angle_between(known.robot_from_object, robot_from_object)) < 3
+    error = known.position - [0.5, 0, 0.2]
+    assert error @ np.linalg.solve(known.covariance[:3, :3], error) < 16
+    assert (plain.scale_known, plain.scale_deviation, plain.object_pose) == (False, 0.0, None)
+
+
+def test_camera_poses_go_before_a_distance_which_goes_before_nothing(network, ball, robot_of_ball):
+    poses, _ = robot_of_ball()
+    of_poses = estimated(network, Scan("ball", ball.views, poses))
+    both = estimated(network, Scan("ball", ball.views, poses), first_view_distance=2.0)
+    np.testing.assert_array_equal(both.cameras[1].position, of_poses.cameras[1].position)
+    one = Scan("ball", ball.views, (poses[0], None, None))
+    distance = estimated(network, one, use="pairs", first_view_distance=2.0)
+    assert distance.scale_known
+    assert (distance.scale_deviation, distance.object_pose) == (0.0, None)
+    assert np.linalg.norm(distance.cameras[0].position) == pytest.approx(2, rel=0.02)
+
+
+def test_camera_poses_that_do_not_tell_the_scale_say_why(network, ball, of_ball, robot_of_ball):
+    vague, _ = robot_of_ball(deviation=1.0)
+    estimate = estimated(network, Scan("ball", ball.views, vague), use="pairs")
+    assert not estimate.scale_known
+    plain = of_ball(use="pairs")
+    start = f"{plain.status} (the robot's camera poses do not tell the scale: the baselines tell it to "
+    assert estimate.status.startswith(start)
+    np.testing.assert_array_equal(estimate.cameras[1].position, plain.cameras[1].position)
 
 
 def test_same_bits_with_evidence_whatever_was_estimated_before(network, ball, ball_on_a_turntable):

@@ -16,7 +16,7 @@ from relpose_ros.inference.global_rotations import solve
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 from relpose_ros.inference.uncertainty import FLOOR, _turns, camera_covariances, describe_pairs
-from relpose_ros.inference.verdict import judge
+from relpose_ros.inference.verdict import judge, without_room
 
 UNCALIBRATED = Calibration()
 UNIFORM_VARIANCE = (math.pi**2 / 3 + 2) / 3  # per axis, of a uniformly random rotation's vector
@@ -47,6 +47,22 @@ def test_a_sharp_pair_has_the_covariance_of_its_density(fisher_scene, cameras_ar
     assert pair.ambiguity_angle == 0
     assert pair.solution_angle < 1e-2
     assert pair.entropy < -3
+
+
+def test_a_modes_covariance_is_that_of_its_core_and_the_total_one_holds_all(fisher_scene, cameras_around):
+    """A sharp peak, a sixth of near misses ten degrees off, a twentieth that may be anywhere."""
+    scene = fisher_scene(cameras_around(2, 0))
+    true = scene.relative(0, 1)
+    sharp = 400.0
+    # exp(-k |w|^2) holds (pi / k)^(3/2) of the 8 pi^2 that all rotations have.
+    heights = [(share * 8 * math.sqrt(math.pi) * k**1.5, k) for share, k in ((0.8, sharp), (0.15, 30.0))]
+    scene.mixtures[0, 1] = [(true, math.log(height), k) for height, k in [*heights, (0.05, 0.0)]]
+    (pair,), _, _ = told(scene)
+    exact = 1 / (2 * sharp)
+    own = np.trace(pair.modes[0].covariance) / 3
+    assert exact < own < 2.5 * exact
+    assert np.trace(pair.covariance) / 3 > 5 * exact
+    assert pair.modes[0].weight > 0.85
 
 
 @pytest.mark.parametrize("concentration", [5.0, 20.0, 80.0])
@@ -145,7 +161,27 @@ def test_enough_needs_trusted_pairs_and_calibrated_ones(fisher_scene, cameras_ar
     assert words.startswith("enough: 3 of 3 pairs agree")
     verdict, _, words = judge(pairs, covariances, calibrated=False)
     assert verdict is Verdict.ONE_MORE_VIEW
-    assert "not calibrated" in words
+    assert words.startswith("not enough: these weights are not calibrated")
+
+
+@pytest.mark.parametrize(
+    ("keep", "advice"),
+    [
+        ("first", "drop_last_view makes room for another one, reset for all"),
+        ("latest", "the next one takes the place of the oldest"),
+        ("spread", "the next one from a new direction takes the place of the view that tells least"),
+    ],
+)
+def test_a_full_scan_is_told_what_to_do_instead_of_one_more_view(keep, advice):
+    words = without_room("one more view: pair 2-5 is ambiguous by about 180 degrees", keep)
+    assert words == f"no room for one more view: pair 2-5 is ambiguous by about 180 degrees; {advice}"
+
+
+@pytest.mark.parametrize(
+    "words", ["enough: 3 of 3 pairs agree", "not enough: these weights are not calibrated"]
+)
+def test_what_asks_for_no_view_stays_as_it_is(words):
+    assert without_room(words, "spread") == words
 
 
 def test_the_verdict_names_the_ambiguous_pair(fisher_scene, cameras_around):

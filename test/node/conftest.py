@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import os
 import random
 import signal
@@ -21,7 +22,7 @@ import pytest
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray
+from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, PoseWithCovarianceStamped, Quaternion
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -333,6 +334,24 @@ class Make:
             k=[f, 0.0, width / 2, 0.0, f, height / 2, 0.0, 0.0, 1.0],
             roi=box,
         )
+
+    @classmethod
+    def camera_pose(
+        cls, stamp_s: float, *, covariance: bool = False
+    ) -> PoseStamped | PoseWithCovarianceStamped:
+        """On a circle, another place each time."""
+        pose = Pose(
+            position=Point(x=math.cos(stamp_s), y=math.sin(stamp_s), z=0.5),
+            orientation=Quaternion(x=0.0, y=0.0, z=math.sin(stamp_s / 2), w=math.cos(stamp_s / 2)),
+        )
+        header = cls.header(stamp_s)
+        header.frame_id = "base"
+        if not covariance:
+            return PoseStamped(header=header, pose=pose)
+        message = PoseWithCovarianceStamped(header=header)
+        message.pose.pose = pose
+        message.pose.covariance = np.diag(np.repeat([1e-6, 1e-4], 3)).reshape(-1)
+        return message
 
     @classmethod
     def object_view(cls, stamp_s: float, object_id: str) -> ObjectView:

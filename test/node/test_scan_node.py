@@ -137,6 +137,38 @@ def test_a_burst_of_fifty_views(node: Any, graph: Any, make: Any) -> None:
         assert graph.set_parameter("keep", "spread") == (True, "")
 
 
+@pytest.mark.parametrize("covariance", [False, True])
+def test_camera_poses_of_the_robot(node: Any, graph: Any, make: Any, covariance: bool) -> None:
+    """What these weights make of noise contradicts any pose: the estimate says that they were heard."""
+    topic = "/camera_pose_with_covariance" if covariance else "/camera_pose"
+    before, rejected = graph.count(topic, "used"), graph.count(topic, "rejected")
+    stamps = (10.0, 11.0, 12.0)
+
+    def publish(_: float) -> None:
+        graph.publish(topic, *(make.camera_pose(stamp, covariance=covariance) for stamp in stamps))
+
+    graph.publish(OBJECT_VIEW, *(make.object_view(stamp, "cup") for stamp in stamps))
+    first = graph.estimate_of("cup", views=3)
+    assert first.object_pose.header.frame_id == ""
+    # Sent again and again, since best effort may lose one: what comes twice is no news.
+    graph.publish_until(lambda: graph.count(topic, "used") == before + 3, "the poses", publish)
+    graph.wait_until(
+        lambda: (
+            "the robot's camera poses do not tell the scale" in graph.estimates[-1].status
+            or graph.estimates[-1].object_pose.header.frame_id == "base"
+        ),
+        "an estimate that heard of the robot",
+    )
+    bad = make.camera_pose(13.0, covariance=covariance)
+    (bad.pose.pose if covariance else bad.pose).orientation.w = float("nan")
+    graph.publish_until(
+        lambda: graph.count(topic, "rejected") > rejected, "a rejection", lambda _: graph.publish(topic, bad)
+    )
+    assert "a rotation's quaternion has 1" in graph.diagnostic(f"{topic} last rejection")
+    graph.publish(OBJECT_VIEW, make.object_view(13.0, "cup"))
+    assert len(graph.estimate_of("cup", views=4).cameras) == 4
+
+
 def test_garbage_in_between_costs_nothing(node: Any, graph: Any, make: Any) -> None:
     truncated, unknown, empty = (make.object_view(11.0 + 0.1 * k, "mug") for k in range(3))
     truncated.image.data = truncated.image.data[:100]

@@ -16,6 +16,8 @@ from relpose_ros.replay.bags import (
     COMPRESSED_IMAGE,
     IMAGE,
     OBJECT_VIEW,
+    POSE_STAMPED,
+    POSE_WITH_COVARIANCE_STAMPED,
     BagError,
     BagReader,
     BagWriter,
@@ -345,6 +347,39 @@ Kind = Literal["object_view", "image", "compressed", "camera_info"]
             {"/photos": COMPRESSED_IMAGE, "/info_from_elsewhere": CAMERA_INFO},
             [],
             {"/photos": ("compressed", "/photos"), "/info_from_elsewhere": ("camera_info", "/photos")},
+        ),
+        (
+            {
+                "/object_view": OBJECT_VIEW,
+                "/camera_pose": POSE_STAMPED,
+                "/camera_pose_with_covariance": POSE_WITH_COVARIANCE_STAMPED,
+                "/ground_truth/pose": POSE_STAMPED,
+            },
+            [],
+            {
+                "/object_view": ("object_view", ""),
+                "/camera_pose": ("camera_pose", ""),
+                "/camera_pose_with_covariance": ("camera_pose", ""),
+            },
+        ),
+        (
+            {"/views": OBJECT_VIEW, "/arm/camera_pose": POSE_STAMPED, "/camera_pose": STRING},
+            [],
+            {"/views": ("object_view", ""), "/arm/camera_pose": ("camera_pose", "")},
+        ),
+        (
+            {**TWO_CAMERAS, "/a/camera_pose": POSE_STAMPED, "/b/camera_pose": POSE_STAMPED},
+            ["/b/image"],
+            {
+                "/b/image": ("image", "/b/image"),
+                "/b/camera_info": ("camera_info", "/b/image"),
+                "/b/camera_pose": ("camera_pose", ""),
+            },
+        ),
+        (
+            {"/views": OBJECT_VIEW, "/a/camera_pose": POSE_STAMPED, "/b/camera_pose": POSE_STAMPED},
+            [],
+            {"/views": ("object_view", "")},
         ),
     ],
 )

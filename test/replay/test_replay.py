@@ -4,6 +4,7 @@ import copy
 import json
 import logging
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from relpose_ros.estimates import ObjectPose
 from relpose_ros.geometry import so3
 from relpose_ros.replay import bags
 from relpose_ros.replay.bags import BagError, BagReader
@@ -67,7 +69,10 @@ def test_one_estimate_for_each_view_from_the_second_on(
     ]
     assert [each["views"] for each in scan["estimates"]] == [list(range(n)) for n in (2, 3, 4, 5)]
     for estimate in scan["estimates"]:
-        assert set(estimate) == {"views", "scale_known", "status", "cameras", "pairs"}
+        assert set(estimate) == {
+            *("views", "scale_known", "scale_deviation", "object_pose", "status", "cameras", "pairs")
+        }
+        assert (estimate["scale_deviation"], estimate["object_pose"]) == (0.0, None)
         count = len(estimate["views"])
         assert [camera["view"] for camera in estimate["cameras"]] == list(range(count))
         assert [(p["i"], p["j"]) for p in estimate["pairs"]] == [
@@ -347,3 +352,70 @@ def test_cameras_that_are_triggered_together_give_a_view_each(
     replay(tmp_path / "both", tmp_path / "out", topics=topics[:1], estimator=fake_estimator(truth))
     page = (tmp_path / "out/report.html").read_text()
     assert ("Against the ground truth, " in page) != truth_of_both
+
+
+def with_camera_poses(record: Record) -> Iterable[Record]:
+    """The true poses once more, as the robot's own."""
+    yield record
+    if record.topic == "/ground_truth/pose":
+        yield record._replace(topic="/camera_pose")
+
+
+def test_the_robots_camera_poses_reach_the_estimator(
+    tmp_path: Path, capture: Capture, rewrite: Rewrite, fake_estimator: Fake
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "plain")
+    rewrite(tmp_path / "plain", tmp_path / "bag", with_camera_poses)
+    inner = fake_estimator(truth)
+
+    class Metric:
+        def estimate(self, scan: Any) -> Any:
+            if len(scan.views) < 3:
+                return inner.estimate(scan)
+            pose = ObjectPose("world", so3.exp([0, 0, 0.5]), np.array([0.3, 0.2, 0.1]), np.diag([1.0] * 6))
+            metric = inner.estimate(scan)
+            return replace(metric, scale_known=True, scale_deviation=0.05, object_pose=pose)
+
+    replay(tmp_path / "bag", tmp_path / "out", estimator=Metric())
+    last = inner.scans[-1]
+    assert [pose.frame_id for pose in last.robot_poses] == ["capture_world"] * 5
+    for pose, true in zip(last.robot_poses, truth, strict=True):
+        np.testing.assert_allclose(pose.robot_from_camera, true.world_from_camera, atol=1e-9)
+        np.testing.assert_allclose(pose.position, true.centre, atol=1e-9)
+
+    told = json.loads((tmp_path / "out/scan.json").read_text())["estimates"]
+    assert told[0]["object_pose"] is None
+    assert (told[-1]["scale_known"], told[-1]["scale_deviation"]) == (True, 0.05)
+    assert told[-1]["object_pose"]["frame_id"] == "world"
+    assert told[-1]["object_pose"]["position"] == [0.3, 0.2, 0.1]
+    assert len(told[-1]["object_pose"]["covariance"]) == 36
+    sent = records(tmp_path / "out/estimates")[-3].message
+    assert sent.object_pose.header.frame_id == "world"
+    assert sent.object_pose.pose.pose.position.x == 0.3
+    assert "Positions are in metres, their scale to 5 %." in (tmp_path / "out/report.html").read_text()
+
+
+def test_camera_poses_of_no_view_are_told(
+    tmp_path: Path,
+    capture: Capture,
+    rewrite: Rewrite,
+    fake_estimator: Fake,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "plain")
+
+    def late(record: Record) -> Iterable[Record]:
+        for each in with_camera_poses(record):
+            if each.topic == "/camera_pose":
+                changed = copy.deepcopy(each.message)
+                changed.header.stamp.nanosec = 1
+                yield each._replace(message=changed)
+            else:
+                yield each
+
+    rewrite(tmp_path / "plain", tmp_path / "bag", late)
+    with caplog.at_level(logging.WARNING, "relpose_ros"):
+        replay(tmp_path / "bag", tmp_path / "out", estimator=fake_estimator(truth))
+    assert "None of the 5 camera poses on /camera_pose has the stamp of a view" in caplog.text

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 MESSAGES = Path(__file__).resolve().parents[2] / "msg"
 
 INCOMING_TYPES = (
+    "geometry_msgs/msg/PoseStamped",
     "sensor_msgs/msg/CameraInfo",
     "sensor_msgs/msg/Image",
     "sensor_msgs/msg/RegionOfInterest",
@@ -101,6 +102,30 @@ class MessageFactory:
             binning_x=binning[0],
             binning_y=binning[1],
             roi=self.roi(*roi),
+        )
+
+    def camera_pose(
+        self,
+        position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0),
+        covariance: np.ndarray | None = None,
+        frame_id: str = "base",
+        **header: Any,
+    ) -> Any:
+        """With a covariance a PoseWithCovarianceStamped, else a PoseStamped."""
+        point, quaternion = (self.types[f"geometry_msgs/msg/{name}"] for name in ("Point", "Quaternion"))
+        pose = self.types["geometry_msgs/msg/Pose"](
+            position=point(**dict(zip("xyz", position, strict=True))),
+            orientation=quaternion(**dict(zip("xyzw", orientation, strict=True))),
+        )
+        stamped = self.header(frame_id=frame_id, **header)
+        if covariance is None:
+            return self.types["geometry_msgs/msg/PoseStamped"](header=stamped, pose=pose)
+        return self.types["geometry_msgs/msg/PoseWithCovarianceStamped"](
+            header=stamped,
+            pose=self.types["geometry_msgs/msg/PoseWithCovariance"](
+                pose=pose, covariance=np.array(covariance, np.float64).reshape(-1)
+            ),
         )
 
     def object_view(

@@ -14,6 +14,7 @@ from relpose_ros.scanning.incoming import (
     Source,
     ViewError,
     object_id_of,
+    robot_pose,
     source_of,
     view_from_image,
     view_from_object_view,
@@ -337,3 +338,57 @@ def test_pairs_always_have_one_stamp_and_memory_is_bounded(arrivals: list[tuple[
             assert pair.info.message[0] == "camera_info"
             assert pair.image.message[0] != "camera_info"
         assert pairing.waiting() <= 8
+
+
+DEVIATIONS = (0.005, 0.01)
+
+
+def pose_of(message: Any) -> Any:
+    return robot_pose(message, source_of(message, "camera_pose"), DEVIATIONS)
+
+
+def test_a_robots_pose_of_a_camera(messages: Any) -> None:
+    half = np.sqrt(0.5)
+    pose = pose_of(messages.camera_pose((1.0, 2.0, 3.0), (0.0, 0.0, half, half), frame_id="arm_base"))
+    assert pose.frame_id == "arm_base"
+    np.testing.assert_allclose(pose.robot_from_camera, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_array_equal(pose.position, [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(pose.covariance, np.diag([0.005**2] * 3 + [0.01**2] * 3))
+
+
+def test_a_covariance_that_comes_with_a_pose_counts_unless_it_is_all_zero(messages: Any) -> None:
+    own = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    own[0, 4] = own[4, 0] = 0.05
+    np.testing.assert_allclose(pose_of(messages.camera_pose(covariance=own)).covariance, own)
+    unknown = pose_of(messages.camera_pose(covariance=np.zeros((6, 6))))
+    np.testing.assert_allclose(unknown.covariance, np.diag([0.005**2] * 3 + [0.01**2] * 3))
+
+
+def test_a_quaternion_that_was_rounded_is_normalised(messages: Any) -> None:
+    rotation = pose_of(messages.camera_pose(orientation=(0.0, 0.0, 0.0, 1.004))).robot_from_camera
+    np.testing.assert_allclose(rotation, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"frame_id": ""}, "frame_id is empty: it names the robot's frame in which the pose is"),
+        ({"frame_id": "a\x00b"}, "cannot be printed"),
+        ({"position": (0.0, NAN, 0.0)}, r"the position holds what is no number: \[0.0, nan, 0.0\]"),
+        ({"orientation": (0.0, 0.0, 0.0, 0.0)}, "has length 0: a rotation's quaternion has 1"),
+        ({"orientation": (0.0, NAN, 0.0, 1.0)}, "has length nan: a rotation's quaternion has 1"),
+        ({"orientation": (0.0, 0.0, 0.0, 1.1)}, r"orientation \[0.0, 0.0, 0.0, 1.1\] has length 1.1"),
+        ({"covariance": np.full((6, 6), NAN)}, "the covariance holds what is no number"),
+        ({"covariance": np.diag([1, 1, 1, 1, 1, -1.0])}, "negative eigenvalue; leave it all zero where"),
+    ],
+)
+def test_a_wrong_pose_is_rejected_with_topic_stamp_and_value(
+    messages: Any, fields: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ViewError, match=rf"^camera_pose, stamp 7\.000000009: .*{said}.*\.$"):
+        pose_of(messages.camera_pose(stamp=(7, 9), **fields))
+
+
+def test_a_pose_whose_stamp_is_no_time_is_rejected(messages: Any) -> None:
+    with pytest.raises(ViewError, match="camera_pose: the stamp is no time: sec is -1"):
+        pose_of(messages.camera_pose(stamp=(-1, 0)))

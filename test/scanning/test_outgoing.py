@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from relpose_ros.estimates import ObjectPose
 from relpose_ros.geometry import so3
 from relpose_ros.scanning.outgoing import (
     TYPE_NAMES,
@@ -52,6 +53,27 @@ def xyzw(orientation: Any) -> list[float]:
 
 def xyz(point: Any) -> list[float]:
     return [point.x, point.y, point.z]
+
+
+def test_where_the_object_is_in_the_robots_frame(messages: Any, scan: Scan, estimate: ScanEstimate) -> None:
+    covariance = np.diag(np.arange(1.0, 7.0))
+    pose = ObjectPose("base", so3.exp([0.3, 0.2, -0.1]), np.array([0.5, -0.2, 0.9]), covariance)
+    metric = replace(estimate, scale_known=True, scale_deviation=0.03, object_pose=pose)
+    message = estimate_message(metric, scan, messages.types, "mug_frame")
+    assert (message.scale_known, message.scale_deviation) == (True, 0.03)
+    told = message.object_pose
+    assert (told.header.frame_id, stamp_of(told.header)) == ("base", (4, 2))
+    assert xyz(told.pose.pose.position) == [0.5, -0.2, 0.9]
+    np.testing.assert_allclose(xyzw(told.pose.pose.orientation), so3.quaternion_xyzw(pose.robot_from_object))
+    np.testing.assert_array_equal(np.reshape(told.pose.covariance, (6, 6)), covariance)
+
+
+def test_an_object_that_nobody_knows_the_place_of(messages: Any, scan: Scan, estimate: ScanEstimate) -> None:
+    message = estimate_message(estimate, scan, messages.types, "mug_frame")
+    assert message.scale_deviation == 0
+    assert message.object_pose.header.frame_id == ""
+    assert message.object_pose.pose.covariance[0] == -1
+    assert message.object_pose.pose.pose.orientation.w == 1
 
 
 def test_an_estimate_is_told_in_full(messages: Any, scan: Scan, estimate: ScanEstimate) -> None:

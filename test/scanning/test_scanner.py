@@ -3,6 +3,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from relpose_ros.errors import RelPoseError
 from relpose_ros.estimates import Verdict
+from relpose_ros.inference.verdict import WITHOUT_ROOM
 from relpose_ros.scanning.image_decoding import ENCODINGS
 from relpose_ros.scanning.scan_buffer import ScanBuffer
 from relpose_ros.scanning.scanner import Receipt, Scanner, TopicStatistics
@@ -735,3 +737,112 @@ def test_how_long_a_callback_takes(
         print(f"\n1920 x 1080 {kind}: median {np.median(spent):.2f} ms, slowest {max(spent):.2f} ms")
     (result,) = drain(scanner)
     assert result.scan.views[0].image.shape == (600, 600, 3)
+
+
+@pytest.mark.parametrize("keep", ["first", "latest", "spread"])
+def test_a_full_scan_is_not_told_to_take_one_more_view(
+    bag_messages: Any, circle_estimator: Callable[..., Any], keep: str
+) -> None:
+    inner = circle_estimator()
+
+    def estimate(scan: Scan) -> ScanEstimate:
+        return replace(inner.estimate(scan), status="one more view: pair 0-1 knows hardly anything")
+
+    scanner = Scanner(SimpleNamespace(estimate=estimate), ScanSettings(max_views=3, keep=keep))
+    told = []
+    for stamp in (1, 2, 3):
+        send_views(scanner, bag_messages, stamp)
+        told += [result.estimate.status for result in drain(scanner)]
+    assert told[0] == "one more view: pair 0-1 knows hardly anything"
+    assert told[1] == f"no room for {told[0]}; {WITHOUT_ROOM[keep]}"
+
+
+def send_pose(scanner: Scanner, messages: Any, stamp: float, x: float = 0.0, **fields: Any) -> Receipt:
+    message = messages.camera_pose((x, 0.0, 0.0), stamp=stamp, **fields)
+    return scanner.receive("camera_pose", "camera_pose", message)
+
+
+def poses_of(scan: Scan) -> list[float | None]:
+    return [None if pose is None else float(pose.position[0]) for pose in scan.robot_poses]
+
+
+def test_a_camera_pose_belongs_to_the_view_of_its_stamp(
+    messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    scanner = Scanner(circle_estimator(), ScanSettings())
+    assert send_pose(scanner, messages, 1, 0.1) == Receipt(False, "", "")
+    send_views(scanner, messages, 1, 2, 3)
+    assert send_pose(scanner, messages, 3, 0.3) == Receipt(True, "mug", "")
+    (result,) = drain(scanner)
+    assert poses_of(result.scan) == [0.1, None, 0.3]
+    assert scanner.statistics().topics["camera_pose"] == TopicStatistics(2, 2, 0, "")
+
+
+def test_a_pose_that_comes_after_the_estimate_has_it_made_anew(
+    messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    scanner = Scanner(circle_estimator(), ScanSettings())
+    send_views(scanner, messages, 1, 2)
+    (before,) = drain(scanner)
+    assert before.scan.robot_poses == ()
+    assert send_pose(scanner, messages, 2, 0.2).accepted
+    (after,) = drain(scanner)
+    assert poses_of(after.scan) == [None, 0.2]
+    assert not send_pose(scanner, messages, 2, 0.2).accepted, "nothing new"
+    assert not send_pose(scanner, messages, 2.5).accepted, "no view has this stamp yet"
+    assert not scanner.pending()
+
+
+def test_a_bad_pose_costs_no_view(messages: Any, circle_estimator: Callable[..., Any]) -> None:
+    scanner = Scanner(circle_estimator(), ScanSettings())
+    receipt = send_pose(scanner, messages, 1, orientation=(0.0, 0.0, 0.0, 0.0))
+    assert receipt.rejected
+    assert receipt.reason.startswith("camera_pose, stamp 1.000000000: the orientation [0.0, 0.0, 0.0, 0.0]")
+    send_views(scanner, messages, 1, 2)
+    assert send_pose(scanner, messages, 2, float("nan")).rejected
+    (result,) = drain(scanner)
+    assert stamps_of(result.scan) == [1, 2]
+    assert result.scan.robot_poses == ()
+    assert scanner.statistics().topics["camera_pose"].rejected == 2
+
+
+def test_a_pose_without_a_covariance_takes_the_deviations_of_the_settings(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    settings = ScanSettings(camera_pose_position_deviation=0.1, camera_pose_rotation_deviation=0.2)
+    scanner = Scanner(circle_estimator(), settings)
+    send_pose(scanner, bag_messages, 1)
+    send_views(scanner, bag_messages, 1, 2)
+    (result,) = drain(scanner)
+    np.testing.assert_allclose(np.diag(result.scan.robot_poses[0].covariance), np.repeat([0.01, 0.04], 3))
+
+
+def test_poses_of_no_view_are_counted_when_they_go(
+    bag_messages: Any, circle_estimator: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("relpose_ros.scanning.robot_poses.KEPT", 2)
+    scanner = Scanner(circle_estimator(), ScanSettings())
+    for stamp in (1, 1.5, 2):
+        send_pose(scanner, bag_messages, stamp)
+    counts = scanner.statistics().topics["camera_pose"]
+    assert (counts.used, counts.rejected) == (0, 1)
+    assert counts.last_reason == (
+        "camera_pose, stamp 1.000000000: no view has this stamp: a camera's pose takes the stamp of the "
+        "image."
+    )
+
+
+def test_a_reset_forgets_the_poses_of_the_views_it_forgets(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    scanner = Scanner(circle_estimator(), ScanSettings())
+    send_views(scanner, bag_messages, 1, 2)
+    send_views(scanner, bag_messages, 3, 4, object_id="can")
+    for stamp in (1, 2, 3, 4):
+        send_pose(scanner, bag_messages, stamp, float(stamp))
+    drain(scanner)
+    scanner.reset("a test asked for it", "mug")
+    send_views(scanner, bag_messages, 1, 2)
+    scanner.estimate_now()
+    results = {each.scan.object_id: poses_of(each.scan) for each in scanner.estimate_now()}
+    assert results == {"mug": [], "can": [3.0, 4.0]}

@@ -1,0 +1,122 @@
+"""What a bundle adjustment makes of an estimate: its frame and its covariances.
+
+The object frame has its origin where the optical axes meet most closely and its unit in the first camera's
+distance. Refined poses tell both by themselves, far better than the look-at translations predicted them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from relpose_ros.geometry import cameras, so3
+from relpose_ros.inference.camera_positions import rows_of
+from relpose_ros.inference.matches import FLOOR, WIDENING
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from relpose_ros.inference.bundle_adjustment import Refined
+
+    FloatArray = npt.NDArray[np.float64]
+
+AXES_APART = 0.2
+"""How far from the others' common point the axes of cameras may pass that nobody could refine, in the unit of
+the estimate: of cameras in a hand."""
+STEP = 1e-6
+"""Of the numeric derivative of the frame by the poses."""
+
+
+def settle(refined: Refined, joint: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Centres and joint covariance after a bundle adjustment, in the frame of the estimate.
+
+    What the points tell joins what was known before, widened as a pair's matches are: errors of features near
+    each other go together, and of the intrinsics nothing is averaged away. Cameras that took no part stay
+    where they were; their errors no longer go with those of the others.
+
+    Args:
+        refined: The adjustment's poses and what its points tell.
+        joint: (6 N, 6 N) covariance before.
+
+    Returns:
+        (N, 3) and (6 N, 6 N).
+    """
+    rotations, moved = refined.rotations, list(refined.moved)
+    centres = cameras.camera_centre(rotations, refined.translations)
+    rows = rows_of(moved)
+    turns = np.zeros((len(moved), 6, len(moved), 6))
+    for slot, camera in enumerate(moved):
+        turns[slot, :, slot] = _by_adjustment(rotations[camera], refined.translations[camera])
+    turn = turns.reshape(len(rows), len(rows))
+    told = turn.T @ refined.information @ turn / WIDENING
+    # The points leave it to what was known before where their cameras stand as a whole. The first camera sets
+    # the frame; of the others, which erred together, all know as much of that as one.
+    share = np.array([1.0 if camera == 0 else 1 / np.sqrt(len(moved) - (0 in moved)) for camera in moved])
+    share = np.repeat(share, 6)
+    before = share[:, None] * np.linalg.inv(joint[np.ix_(rows, rows)]) * share
+    spread = np.linalg.inv(before + told)
+    if 0 in moved:
+        silent = 1 - len(moved) / len(rotations)
+        centres[moved], spread = _about_the_axes(rotations[moved], centres[moved], spread, silent)
+    for slot, camera in enumerate(moved):
+        own = np.arange(6 * slot, 6 * slot + 6)
+        spread[own[:3], own[:3]] += FLOOR**2 * float(centres[camera] @ centres[camera])
+        if camera != 0:  # whose axes are the frame's
+            spread[own[3:], own[3:]] += FLOOR**2
+    settled = joint.copy()
+    settled[rows] = 0
+    settled[:, rows] = 0
+    settled[np.ix_(rows, rows)] = (spread + spread.T) / 2
+    return centres, settled
+
+
+def _by_adjustment(camera_from_object: FloatArray, translation: FloatArray) -> FloatArray:
+    """From a small change of position and rotation in the object frame to the adjustment's own. -> (6, 6).
+
+    A turn r of the camera in the object's axes is the turn e = -R r of camera_from_object; it and a shift d
+    of the centre change the translation t by -R d + e x t.
+    """
+    change = np.zeros((6, 6))
+    change[:3, 3:] = change[3:, :3] = -camera_from_object
+    change[3:, 3:] = so3.hat(translation) @ camera_from_object
+    return change
+
+
+def _about_the_axes(
+    rotations: FloatArray, centres: FloatArray, spread: FloatArray, silent: float
+) -> tuple[FloatArray, FloatArray]:
+    """Origin where the axes meet, first camera at distance 1; as it was where they hardly meet.
+
+    Args:
+        rotations: (M, 3, 3) camera_from_object, the scan's first camera first.
+        centres: (M, 3).
+        spread: (6 M, 6 M) their covariance.
+        silent: Share of the scan's cameras that are not among these, whose axes belong to the origin too.
+    """
+    origin = cameras.closest_point_to_axes(rotations, centres)
+    in_front = np.einsum("ma,ma->m", rotations[:, 2], origin - centres)
+    if in_front.min() <= 0:
+        return centres, spread
+    size = len(spread)
+    jacobian = np.eye(size)
+    positions = rows_of(range(len(centres)), 3)
+    for column in range(size):
+        shift = np.zeros((len(centres), 6))
+        shift.reshape(-1)[column] = STEP
+        above, below = (_framed(rotations, centres, sign * shift) for sign in (1.0, -1.0))
+        jacobian[positions, column] = (above - below).reshape(-1) / (2 * STEP)
+    framed = jacobian @ spread @ jacobian.T
+    if np.trace(framed[np.ix_(positions, positions)]) > np.trace(spread[np.ix_(positions, positions)]):
+        return centres, spread
+    together = np.kron(np.ones((len(centres), len(centres))), np.eye(3))
+    framed[np.ix_(positions, positions)] += (AXES_APART * silent) ** 2 * together
+    return _framed(rotations, centres, np.zeros((len(centres), 6))), framed
+
+
+def _framed(rotations: FloatArray, centres: FloatArray, change: FloatArray) -> FloatArray:
+    """Centres about the point closest to all axes, after changes (M, 6) of positions and rotations."""
+    turned = rotations @ so3.exp(-change[:, 3:])
+    moved = centres + change[:, :3]
+    offsets = moved - cameras.closest_point_to_axes(turned, moved)
+    return np.asarray(offsets / np.linalg.norm(offsets[0]))

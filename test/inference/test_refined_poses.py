@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from relpose_ros.geometry import cameras, so3
+from relpose_ros.inference.bundle_adjustment import refine
+from relpose_ros.inference.camera_positions import apart, joined
+from relpose_ros.inference.matches import NOTHING, RelativePose, TwoViewGeometry, match
+from relpose_ros.inference.refined_poses import settle
+
+ANGLES = [0.0, 20.0, 40.0, 60.0]
+BEFORE = np.diag([0.1**2] * 3 + [math.radians(5) ** 2] * 3)
+
+
+def adjusted(scene, silent=(), noise=0.5, degrees=1.0, shift=0.02, seed=0):
+    """A bundle adjustment of poses that are a little off; ``silent`` cameras have no matches."""
+    features = scene.features(noise=noise, seed=seed)
+    geometries = {}
+    for i, j in itertools.combinations(range(len(features)), 2):
+        rotation, direction = scene.relative(i, j)
+        pose = RelativePose(rotation, direction, 1e-4 * np.eye(3), 1e-4 * np.eye(3), 1.0)
+        found = TwoViewGeometry((pose,), match(features[i], features[j]), 0.95)
+        geometries[i, j] = NOTHING if i in silent or j in silent else found
+    generator = np.random.default_rng([seed, 2])
+    turns = np.radians(degrees) * generator.standard_normal((len(scene.rotations), 3))
+    shifts = shift * generator.standard_normal(turns.shape)
+    turns[0] = shifts[0] = 0
+    return refine(so3.exp(turns) @ scene.rotations, scene.translations + shifts, features, geometries)
+
+
+def before(count):
+    covariances = np.tile(BEFORE, (count, 1, 1))
+    covariances[0] *= 1e-4
+    return joined(covariances)
+
+
+def true_centres(scene):
+    """As the object frame has them: about the point closest to all axes, the first at distance 1."""
+    translations, _, _ = cameras.look_at_translations(scene.rotations, scene.translations)
+    return cameras.camera_centre(scene.rotations, translations)
+
+
+def test_the_origin_is_where_the_axes_meet_and_the_first_camera_at_distance_one(point_scene):
+    scene = point_scene.ring(ANGLES)
+    refined = adjusted(scene)
+    centres, _ = settle(refined, before(4))
+    np.testing.assert_allclose(cameras.closest_point_to_axes(refined.rotations, centres), 0, atol=1e-9)
+    assert np.linalg.norm(centres[0]) == pytest.approx(1)
+    assert np.linalg.norm(centres - true_centres(scene), axis=1).max() < 0.02
+
+
+def test_errors_are_within_what_is_stated_and_that_is_less_than_before(point_scene):
+    """Stated deviations are widened on purpose: features of a photograph do not err each for themselves."""
+    turns, shifts = [], []
+    for seed in range(6):
+        scene = point_scene.ring(ANGLES, seed=seed)
+        refined = adjusted(scene, noise=1.0, degrees=0.5, shift=0.01, seed=seed)
+        centres, joint = settle(refined, before(4))
+        covariances = apart(joint)
+        np.testing.assert_array_equal(joint, joint.T)
+        assert np.linalg.eigvalsh(joint).min() > 0
+        errors = true_centres(scene) - centres
+        for camera in range(1, 4):
+            turn = so3.log(scene.rotations[camera].T @ refined.rotations[camera])
+            turns.append(turn @ np.linalg.solve(covariances[camera, 3:, 3:], turn))
+            error = errors[camera]
+            shifts.append(error @ np.linalg.solve(covariances[camera, :3, :3], error))
+            assert np.trace(covariances[camera, 3:, 3:]) < 0.2 * np.trace(BEFORE[3:, 3:])
+            assert np.trace(covariances[camera, :3, :3]) < 0.2 * np.trace(BEFORE[:3, :3])
+    assert np.mean(turns) < 3
+    assert np.mean(shifts) < 3
+
+
+def test_fewer_points_know_less(point_scene):
+    many, few = (
+        settle(adjusted(point_scene.ring(ANGLES, points=count)), before(4))[1] for count in (200, 40)
+    )
+    for rich, poor in zip(apart(many)[1:], apart(few)[1:], strict=True):
+        assert np.trace(rich[3:, 3:]) < np.trace(poor[3:, 3:])
+        assert np.trace(rich[:3, :3]) < np.trace(poor[:3, :3])
+
+
+def test_a_camera_that_took_no_part_keeps_what_was_known_of_it(point_scene):
+    scene = point_scene.ring(ANGLES)
+    refined = adjusted(scene, silent=(2,))
+    assert refined.moved == (0, 1, 3)
+    centres, joint = settle(refined, before(4))
+    np.testing.assert_array_equal(apart(joint)[2], BEFORE)
+    np.testing.assert_array_equal(joint[12:18, :12], 0)
+    np.testing.assert_allclose(centres[2], cameras.camera_centre(refined.rotations, refined.translations)[2])
+    # Its axis belongs to the origin too, and nobody knows it.
+    whole = settle(adjusted(scene), before(4))[1]
+    assert np.trace(joint[6:9, 6:9]) > 2 * np.trace(whole[6:9, 6:9])
+
+
+def test_cameras_apart_from_the_first_are_known_among_themselves_alone(point_scene):
+    scene = point_scene.ring(ANGLES)
+    refined = adjusted(scene, silent=(0,))
+    assert refined.moved == (1, 2, 3)
+    _, joint = settle(refined, before(4))
+    assert np.trace(joint[9:12, 9:12]) > 0.3 * np.trace(BEFORE[3:, 3:])
+    relative = joint[9:12, 9:12] + joint[15:18, 15:18] - joint[9:12, 15:18] - joint[15:18, 9:12]
+    assert np.trace(relative) < 0.1 * np.trace(BEFORE[3:, 3:])
+
+
+def test_axes_that_hardly_meet_leave_origin_and_unit_as_they_were(point_scene):
+    """Positions were known better than two degrees between the axes tell."""
+    scene = point_scene.ring([0.0, 2.0, 4.0])
+    refined = adjusted(scene, degrees=0.2, shift=0.002)
+    known = joined(np.tile(np.diag([0.002**2] * 3 + [math.radians(5) ** 2] * 3), (3, 1, 1)))
+    centres, _ = settle(refined, known)
+    np.testing.assert_array_equal(centres, cameras.camera_centre(refined.rotations, refined.translations))
