@@ -83,7 +83,13 @@ def test_several_parameters_change_together() -> None:
     assert changed == ScanSettings(max_scans=2, max_views=5, keep="latest")
 
 
-OTHER_VALUES = {"weights": "mine.safetensors", "threads": 3, "image_transports": ["raw"], "autostart": False}
+OTHER_VALUES = {
+    "weights": "mine.safetensors",
+    "precision": "bfloat16",
+    "threads": 3,
+    "image_transports": ["raw"],
+    "autostart": False,
+}
 
 
 @pytest.mark.parametrize("name", sorted(ONLY_UNCONFIGURED - {"autostart"}))
