@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from relpose_ros.geometry.cameras import translation_of
-from relpose_ros.inference.verdict import LARGEST_DEVIATION
+from relpose_ros.inference.verdict import LARGEST_DEVIATION, rotation_deviations
 from relpose_ros.views import Scan
 
 if TYPE_CHECKING:
@@ -66,8 +66,7 @@ class Estimated:
             estimate = self._estimator.estimate(Scan(object_id="evaluation", views=key))
             rotations = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
             positions = np.stack([camera.position for camera in estimate.cameras])
-            spreads = np.stack([camera.covariance[3:, 3:] for camera in estimate.cameras])
-            deviations = np.sqrt(np.linalg.eigvalsh(spreads)[:, -1])
+            deviations = rotation_deviations(np.stack([camera.covariance for camera in estimate.cameras]))
             translations = translation_of(rotations, positions)
             self._last = key, Poses(rotations, translations, deviations, estimate)
         return self._last[1]

@@ -48,7 +48,7 @@ EVIDENCE = {
     "geometry": EvidenceSettings("pairs", learned=False),
 }
 """What the estimator rests on in each of these methods."""
-OF_THE_WEIGHTS = {*EVIDENCE, "constant-translation"}
+OF_THE_WEIGHTS = {*EVIDENCE, *DERIVED}
 """The methods that ask the network."""
 OF_DISTRIBUTIONS = {"relpose", "relpose-known", "both", "geometry"}
 """The methods that a network which regresses poses has not: nothing joins those."""
@@ -335,9 +335,8 @@ def evaluate(
     total = orders * len(chosen) * sum(n <= len(s.camera_from_world) for n in set(views) for s in sequences)
     with tqdm(total=total, unit="scan", disable=not progress) as bar:
         for sequence in sequences:
-            _write(
-                rows, output
-            )  # before the first capture, to know that it can be; then for who interrupts it
+            # Before the first capture, to know that it can be; then for who interrupts it.
+            _write(rows, output)
             bar.set_postfix_str(sequence.name)
             scans = _scans(sequence, chosen, views, orders, seed, bar.update)
             rows += _rows(sequence.name, scans)

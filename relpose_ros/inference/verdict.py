@@ -60,7 +60,7 @@ def judge(
         covariances: (N, 6, 6) of the cameras.
         calibrated: whether the probabilities were calibrated.
     """
-    deviations = np.sqrt(np.linalg.eigvalsh(covariances[:, 3:, 3:])[:, -1])
+    deviations = rotation_deviations(covariances)
     tied = _tied(pairs, len(covariances))
     trusted = [pair for pair in pairs if pair.solution_probability >= TRUSTED]
     ties = np.bincount([view for pair in trusted for view in (pair.i, pair.j)], minlength=len(covariances))
@@ -94,6 +94,11 @@ def judge(
             f"rotations are known to about {worst:.0f} degrees only, the weak link is pair {pair.i}-{pair.j}"
         )
     return Verdict.ONE_MORE_VIEW, weakest, f"{ONE_MORE}{reason}"
+
+
+def rotation_deviations(covariances: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Standard deviation of each camera's rotation about its worst axis, rad. (..., 6, 6) -> (...)."""
+    return np.asarray(np.sqrt(np.linalg.eigvalsh(covariances[..., 3:, 3:])[..., -1]))
 
 
 def without_room(words: str, keep: str) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 
 from relpose_ros.estimates import Evidence, Verdict
 from relpose_ros.geometry import so3
+from relpose_ros.inference.verdict import rotation_deviations
 from relpose_ros.replay.comparison import compare
 from relpose_ros.scanning.outgoing import is_weak, view_colour
 from relpose_ros.views import MAX_VIEWS
@@ -176,7 +177,7 @@ def _camera(camera: CameraPose) -> dict[str, Any]:
         "q": _rounded(so3.quaternion_xyzw(camera.object_from_camera)),
         # The half axes of the ellipsoid of one standard deviation, one a row.
         "spread": _rounded((axes * np.sqrt(np.maximum(variances, 0))).T),
-        "turn": _rounded(np.degrees(np.sqrt(np.linalg.eigvalsh(camera.covariance[3:, 3:])[-1]))),
+        "turn": _rounded(np.degrees(rotation_deviations(camera.covariance))),
     }
 
 

@@ -202,7 +202,7 @@ def test_what_is_no_variant_or_one_twice_is_refused(weights):
 
 def test_weights_that_regress_are_measured_by_the_methods_they_have(weights):
     sequence = posed(3)
-    for method in ("relpose", "both", "geometry"):
+    for method in ("relpose", "relpose-known", "both", "geometry"):
         with pytest.raises(EvaluationError, match=f"measure 'learned', not '{method}'"):
             protocol.evaluate([sequence], [2], weights("regression"), [method], progress=False)
     pytest.importorskip("pycolmap")
