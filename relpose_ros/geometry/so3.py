@@ -122,6 +122,12 @@ def random_rotations(count: int, generator: np.random.Generator) -> FloatArray:
     return from_quaternion_xyzw(generator.standard_normal((count, 4)))
 
 
+def ball_fraction(angle: npt.ArrayLike) -> FloatArray:
+    """Fraction of all rotations that turn by at most ``angle`` (rad, 0 to pi): (angle - sin angle) / pi."""
+    a = np.asarray(angle, np.float64)
+    return np.asarray((a - np.sin(a)) / np.pi)
+
+
 def project(matrix: npt.ArrayLike) -> FloatArray:
     """The rotation nearest to a matrix in the Frobenius norm. (..., 3, 3) -> (..., 3, 3)."""
     u, _, vt = np.linalg.svd(np.asarray(matrix, np.float64))

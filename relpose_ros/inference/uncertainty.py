@@ -115,6 +115,7 @@ def pairs_of_unknown_trust(rotations: FloatArray) -> tuple[PairRotation, ...]:
         rotations: (N, 3, 3) camera_from_object.
     """
     covariance = UNIFORM_VARIANCE * np.eye(3)
+    within = float(so3.ball_fraction(WITHIN))
     pairs = []
     for i, j in combinations(range(len(rotations)), 2):
         relative = rotations[j] @ rotations[i].T
@@ -125,20 +126,15 @@ def pairs_of_unknown_trust(rotations: FloatArray) -> tuple[PairRotation, ...]:
                 camera_j_from_camera_i=relative,
                 covariance=covariance,
                 entropy=0.0,
-                probability_within_15_deg=_uniform_share(WITHIN),
-                modes=(Mode(relative, _uniform_share(BASIN), covariance),),
+                probability_within_15_deg=within,
+                modes=(Mode(relative, float(so3.ball_fraction(BASIN)), covariance),),
                 ambiguous=False,
                 ambiguity_angle=0.0,
-                solution_probability=_uniform_share(WITHIN),
+                solution_probability=within,
                 solution_angle=0.0,
             )
         )
     return tuple(pairs)
-
-
-def _uniform_share(radius: float) -> float:
-    """Of all rotations, those within an angle of a given one."""
-    return (radius - math.sin(radius)) / math.pi
 
 
 def _evidence(energies: PairEnergies, pair: int) -> Evidence:

@@ -14,6 +14,7 @@ from relpose_ros.geometry.cameras import translation_of
 from relpose_ros.replay.bags import POSE_STAMPED, BagError, BagReader, choose_inputs
 from relpose_ros.replay.comparison import TruePose
 from relpose_ros.scanning.incoming import (
+    QUATERNION_TOLERANCE,
     Arrival,
     Pairing,
     ViewError,
@@ -100,7 +101,8 @@ def read_true_poses(reader: BagReader) -> dict[int, TruePose]:
         q, p = pose.orientation, pose.position
         quaternion, centre = np.array([q.x, q.y, q.z, q.w]), np.array([p.x, p.y, p.z])
         stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
-        if not np.isfinite(centre).all() or not 0.99 < np.linalg.norm(quaternion) < 1.01:
+        unit = abs(np.linalg.norm(quaternion) - 1) < QUATERNION_TOLERANCE
+        if not (np.isfinite(centre).all() and unit):
             logger.warning(
                 "The true pose on %s with stamp %d ns is no pose; it is left out.", record.topic, stamp_ns
             )

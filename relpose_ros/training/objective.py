@@ -85,19 +85,14 @@ class Targets:
     """Of the batch."""
 
 
-def ball_fraction(angle: npt.ArrayLike) -> FloatArray:
-    """Fraction of all rotations that turn by at most ``angle`` (rad, 0 to pi): (angle - sin angle) / pi."""
-    a = np.asarray(angle, np.float64)
-    return np.asarray((a - np.sin(a)) / math.pi)
-
-
 def rotations_near(
     truth: npt.ArrayLike, count: int, angle: float, generator: np.random.Generator
 ) -> FloatArray:
     """Rotations drawn uniformly among those within ``angle`` of the truth. (P, 3, 3) -> (P, count, 3, 3)."""
     t = np.asarray(truth, np.float64)
     grid = np.linspace(0, angle, 512)
-    turn = np.interp(generator.random((len(t), count)), ball_fraction(grid) / ball_fraction(angle), grid)
+    share = so3.ball_fraction(grid) / so3.ball_fraction(angle)
+    turn = np.interp(generator.random((len(t), count)), share, grid)
     axis = generator.normal(size=(len(t), count, 3))
     axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
     return so3.exp(turn[..., None] * axis) @ t[:, None]
@@ -114,7 +109,7 @@ def mixture_log_density(
     density = np.full(a.shape, float(uniform))
     if near:
         for radius in near_angles:
-            density += near / len(near_angles) * (a <= radius) / ball_fraction(radius)
+            density += near / len(near_angles) * (a <= radius) / so3.ball_fraction(radius)
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(density / (uniform + near)))
 

@@ -145,3 +145,10 @@ def test_the_torch_twin_agrees_and_has_the_right_slope(vector: np.ndarray, angle
     ]
     assert rotation_vector.grad is not None
     assert rotation_vector.grad.numpy() == pytest.approx(numeric, abs=1e-6)
+
+
+def test_the_ball_s_fraction_is_that_of_random_rotations() -> None:
+    turned = so3.angle_between(so3.random_rotations(20000, np.random.default_rng(0)), np.eye(3))
+    for angle in (0.5, 1.0, 2.0, 3.0):
+        assert so3.ball_fraction(angle) == pytest.approx((turned <= angle).mean(), abs=0.01)
+    assert so3.ball_fraction(np.pi) == pytest.approx(1)
