@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from relpose_ros.geometry import so3
+from relpose_ros.geometry.cameras import homogeneous
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     import numpy.typing as npt
 
-    from relpose_ros.inference.matches import LocalFeatures, TwoViewGeometry
+    from relpose_ros.inference.local_features import LocalFeatures
+    from relpose_ros.inference.matches import TwoViewGeometry
 
     FloatArray = npt.NDArray[np.float64]
     IntArray = npt.NDArray[np.int64]
@@ -208,7 +210,7 @@ def _triangulate(poses: tuple[FloatArray, FloatArray], seen: _Observations) -> t
 
 def _directions(rotations: FloatArray, seen: _Observations) -> FloatArray:
     """Unit rays in the object frame. -> (Q, 3)."""
-    rays = np.concatenate([seen.rays, np.ones((len(seen.rays), 1))], 1)
+    rays = homogeneous(seen.rays)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     return np.asarray(np.einsum("qba,qb->qa", rotations[seen.camera], rays))
 

@@ -10,7 +10,8 @@ import pytest
 from relpose_ros.geometry import so3
 from relpose_ros.inference import bundle_adjustment
 from relpose_ros.inference.bundle_adjustment import LEAST_POINTS, _Observations, _Problem, refine
-from relpose_ros.inference.matches import NOTHING, RelativePose, TwoViewGeometry, match
+from relpose_ros.inference.local_features import match
+from relpose_ros.inference.matches import NOTHING, RelativePose, TwoViewGeometry
 
 ANGLES = [0.0, 20.0, 40.0, 60.0]
 
