@@ -44,7 +44,7 @@ proportion."""
 PLANAR_SHARE = 0.8
 """Of the matches, explained by one homography: from here on the points may lie on a plane, which two poses
 explain equally well, or the camera may only have turned."""
-TRUST = (-11.71, 2.49, 4.99)
+TRUST = (-12.42, 1.93, 7.51)
 """Coefficients of `trust`: of the logarithm of the inliers, and of their coherence."""
 LARGEST_TRUST = 0.995
 """No captures are enough to learn how rare the rarest mistakes are."""
@@ -163,7 +163,7 @@ def explain(
     stated = _with_covariances(poses, weights, near_i, near_j, pixel)
     if first.guessed or second.guessed:
         stated = tuple(_widened(pose) for pose in stated)
-    return stated, inliers, support
+    return stated, np.stack([first.places[inliers[:, 0]], second.places[inliers[:, 1]]], 1), support
 
 
 def trust(support: Support) -> float:

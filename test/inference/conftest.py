@@ -130,7 +130,12 @@ class PointScene:
             orientations = 0.2 * turning.standard_normal(len(rays))
             orientations[len(rays) - outliers :] = turning.uniform(-np.pi, np.pi, outliers)
             order = generator.permutation(len(rays))
-            found.append(LocalFeatures(rays[order], orientations[order], descriptors[order], PIXEL, guessed))
+            places, plain = np.arange(len(rays)), len(rays)
+            found.append(
+                LocalFeatures(
+                    rays[order], orientations[order], descriptors[order], places, plain, PIXEL, guessed
+                )
+            )
         return found
 
 

@@ -18,7 +18,9 @@ def pixels(features, view):
 
 
 def features_of(descriptors):
-    return LocalFeatures(np.zeros((len(descriptors), 2)), np.zeros(len(descriptors)), descriptors, 1.0, False)
+    count = len(descriptors)
+    rays, orientations = np.zeros((count, 2)), np.zeros(count)
+    return LocalFeatures(rays, orientations, descriptors, np.arange(count), count, 1.0, False)
 
 
 # Which features belong together.
@@ -51,6 +53,21 @@ def test_one_feature_cannot_be_distinct(count):
     some = features_of(np.eye(5, 128, dtype=np.float32))
     assert match(none, some).shape == (0, 2)
     assert match(some, none).shape == (0, 2)
+
+
+def test_no_two_matches_are_of_the_same_places():
+    descriptors = np.eye(4, 128, dtype=np.float32)
+    twice = replace(features_of(descriptors), places=np.array([0, 1, 0, 3]))
+    assert match(twice, twice).tolist() == [[0, 0], [1, 1], [3, 3]]
+    # In one view alone the same place may match two.
+    assert match(twice, features_of(descriptors)).tolist() == [[0, 0], [1, 1], [2, 2], [3, 3]]
+
+
+def test_squeezed_features_match_plain_ones_not_each_other():
+    descriptors = np.eye(6, 128, dtype=np.float32)
+    first = replace(features_of(descriptors[:4]), plain=2)
+    second = replace(features_of(descriptors[[2, 5, 1, 3]]), plain=2)
+    assert match(first, second).tolist() == [[2, 0], [1, 2]]
 
 
 # Features of a picture.
@@ -130,6 +147,34 @@ def test_without_intrinsics_the_focal_length_is_guessed(textured):
     known = find_features(replace(view, intrinsics=Intrinsics(240, 240, 100, 80)))
     assert not known.guessed
     np.testing.assert_allclose(known.rays, features.rays)
+
+
+def test_a_surface_at_a_slant_matches(textured):
+    """A picture, and half its width: a surface turned by sixty degrees."""
+    view = textured(4, intrinsics=Intrinsics(300, 300, 100, 80))
+    narrow = np.ascontiguousarray(cv2.resize(view.image, (100, 160), interpolation=cv2.INTER_AREA))
+    slanted = View(narrow, BoundingBox(0, 0, 100, 160), 100, 160, intrinsics=Intrinsics(300, 300, 50, 80))
+    for pair in ((view, slanted), (slanted, view)):
+        features = [find_features(each) for each in pair]
+        together = match(*features)
+        places = [pixels(each, v)[m] for each, v, m in zip(features, pair, together.T, strict=True)]
+        wide, thin = places if pair[0] is view else places[::-1]
+        right = np.linalg.norm(wide * [0.5, 1] - thin, axis=1) < 1.5
+        squeezed = (together >= [each.plain for each in features]).any(1)
+        assert (right & squeezed).sum() > 30
+        assert (right & squeezed).sum() > 3 * (right & ~squeezed).sum()
+
+
+def test_a_feature_of_both_pictures_has_one_place(textured):
+    features = find_features(textured(5))
+    squeezed = np.arange(features.plain, len(features.rays))
+    shared = squeezed[features.places[squeezed] < features.plain]
+    assert len(shared) > 20
+    apart = np.linalg.norm(features.rays[shared] - features.rays[features.places[shared]], axis=1)
+    assert apart.max() <= 2.0001 * features.pixel
+    others = np.setdiff1d(squeezed, shared)
+    assert (features.places[others] >= features.plain).all()
+    np.testing.assert_array_equal(features.places[features.places], features.places)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (5, 3), (40, 60)])

@@ -165,10 +165,11 @@ def test_identical_features_everywhere_say_nothing():
     generator = np.random.default_rng(0)
     descriptors = generator.standard_normal((30, 128)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    upright = np.zeros(30)
     on_line = np.linspace(-0.2, 0.2, 30)[:, None] * [1.0, 0.3]
-    same = LocalFeatures(np.zeros((30, 2)), upright, descriptors, 1 / 800, False)
-    line = LocalFeatures(on_line, upright, descriptors, 1 / 800, False)
+    same, line = (
+        LocalFeatures(rays, np.zeros(30), descriptors, np.arange(30), 30, 1 / 800, False)
+        for rays in (np.zeros((30, 2)), on_line)
+    )
     for first, second in [(same, same), (line, line), (same, line)]:
         found = relate(first, second)
         assert all(np.isfinite(pose.rotation).all() for pose in found.poses)
