@@ -8,12 +8,15 @@ column-vector ``camera_j_from_camera_i``.
 
 from __future__ import annotations
 
+import itertools
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import torch
 
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import homogeneous
@@ -44,7 +47,7 @@ proportion."""
 PLANAR_SHARE = 0.8
 """Of the matches, explained by one homography: from here on the points may lie on a plane, which two poses
 explain equally well, or the camera may only have turned."""
-TRUST = (-12.42, 1.93, 7.51)
+TRUST = (-11.19, 1.91, 5.98)
 """Coefficients of `trust`: of the logarithm of the inliers, and of their coherence."""
 LARGEST_TRUST = 0.995
 """No captures are enough to learn how rare the rarest mistakes are."""
@@ -65,8 +68,10 @@ SEPARATION = math.radians(5)
 TEMPER = 5.0
 """Divisor of an explanation's cost: errors of features near each other go together, and of two explanations
 the better one is often the wrong one by a hair. Fitted: the right one's likelihood is highest with it."""
-LEAST_WEIGHT = 0.01
-"""Of an explanation that is worth telling."""
+LEAST_WEIGHT = 0.03
+"""Of an explanation that is worth telling, relative to the best."""
+MOST_EXPLANATIONS = 4
+"""More say hardly anything, and each costs the solver time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +87,7 @@ class RelativePose:
     direction_covariance: FloatArray
     """(3, 3) of ``direction``, tangential to it."""
     weight: float
-    """Relative to the pair's other explanations; they sum to one."""
+    """Relative to the pair's other explanations; they sum to one, less what is not worth telling."""
 
 
 @dataclass(frozen=True)
@@ -222,13 +227,14 @@ def _of_plane(rays_i: FloatArray, rays_j: FloatArray, pixel: float) -> Poses:
 
 def _distinct(poses: Poses, costs: FloatArray) -> tuple[Poses, FloatArray]:
     """Poses that differ, best first, weighted (S,) by how well each explains the matches."""
+    likelihoods = np.exp(-(costs - costs.min()) / TEMPER)
     kept: list[int] = []
     for k in np.argsort(costs, kind="stable").tolist():
         apart = so3.angle_between(poses.rotations[kept], poses.rotations[k])
-        if (costs[k] - costs.min()) / TEMPER < -math.log(LEAST_WEIGHT) and (apart > SEPARATION).all():
+        if likelihoods[k] > LEAST_WEIGHT and (apart > SEPARATION).all():
             kept.append(k)
-    weights = np.exp(-(costs[kept] - costs.min()) / TEMPER)
-    return poses[np.array(kept)], np.asarray(weights / weights.sum())
+    weights = likelihoods[kept] / likelihoods[kept].sum()
+    return poses[np.array(kept[:MOST_EXPLANATIONS])], weights[:MOST_EXPLANATIONS]
 
 
 def _with_covariances(
@@ -283,15 +289,17 @@ class Matcher:
         return self._features[view]
 
     def geometries(self, views: Sequence[View]) -> dict[tuple[int, int], TwoViewGeometry]:
-        """Of every pair of views i < j, by their positions."""
-        found = {}
-        for i, first in enumerate(views):
-            known = self._pairs.setdefault(first, WeakKeyDictionary())
-            for j, second in enumerate(views[i + 1 :], i + 1):
-                if second not in known:
-                    known[second] = relate(self.features(first), self.features(second))
-                found[i, j] = known[second]
-        return found
+        """Of every pair of views i < j, by their positions. What is new is worked out on torch's threads."""
+        pairs = list(itertools.combinations(range(len(views)), 2))
+        known = {(i, j): self._pairs.setdefault(views[i], WeakKeyDictionary()) for i, j in pairs}
+        new = [(i, j) for i, j in pairs if views[j] not in known[i, j]]
+        unseen = dict.fromkeys(views[view] for pair in new for view in pair)  # each once, in order
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            features = dict(zip(unseen, pool.map(self.features, unseen), strict=True))
+            found = pool.map(lambda pair: relate(*(features[views[view]] for view in pair)), new)
+            for (i, j), geometry in zip(new, found, strict=True):
+                known[i, j][views[j]] = geometry
+        return {(i, j): known[i, j][views[j]] for i, j in pairs}
 
 
 def peaks(geometry: TwoViewGeometry) -> list[Peak]:

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from relpose_ros.captures.folder import load_capture
 from relpose_ros.geometry import so3
@@ -22,6 +24,7 @@ from relpose_ros.inference.matches import (
     relate,
     trust,
 )
+from relpose_ros.views import BoundingBox
 
 
 def degrees(a, b):
@@ -288,3 +291,24 @@ def test_neighbouring_photographs(shared):
         found = relate(*(find_features(capture.view(k)) for k in (i, i + 2)))
         errors.append(degrees(found.poses[0].rotation, truth) if found.poses else 180)
     assert np.mean(np.array(errors) < 5) >= 0.8, errors
+
+
+def test_the_same_bits_on_any_number_of_threads(textured):
+    whole = textured(0, 120, 260)
+    boxes = [BoundingBox(left, 0, left + 140, 120) for left in (0, 30, 60, 90)]
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            found.append(Matcher().geometries([replace(whole, box=box) for box in boxes]))
+    finally:
+        torch.set_num_threads(threads)
+    one, three = found
+    assert list(one) == list(three) == list(itertools.combinations(range(4), 2))
+    assert any(geometry.poses for geometry in one.values())
+    for pair, geometry in one.items():
+        assert geometry.probability == three[pair].probability
+        assert geometry.inliers.tobytes() == three[pair].inliers.tobytes()
+        for a, b in zip(geometry.poses, three[pair].poses, strict=True):
+            assert a.rotation.tobytes() == b.rotation.tobytes()
+            assert a.covariance.tobytes() == b.covariance.tobytes()
