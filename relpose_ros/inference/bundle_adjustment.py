@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     FloatArray = npt.NDArray[np.float64]
     IntArray = npt.NDArray[np.int64]
 
-MOST_POINTS = 250
+MOST_POINTS = 400
 """The longest tracks; more cost time and add little."""
 LEAST_POINTS = 12
 """Fewer do not hold the poses better than the pairs do."""
