@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 MIN_VIEWS = 2
 MAX_VIEWS = 8
 """The network's index table has eight rows (RelPose++ is trained on 2 to 8 views)."""
+GUESSED_FOCAL = 1.2
+"""Focal length in longer image sides where a camera said nothing: a phone's main camera, and between a
+webcam's and a portrait lens's."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,12 @@ class Intrinsics:
     fy: float
     cx: float
     cy: float
+
+    @classmethod
+    def guessed(cls, width: int, height: int) -> Intrinsics:
+        """What to assume of a camera that said nothing but the size of its image, pixels."""
+        focal = GUESSED_FOCAL * max(width, height)
+        return cls(focal, focal, width / 2, height / 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relpose_ros.geometry import so3
-from relpose_ros.inference.matches import find_features, match, relate
+from relpose_ros.inference.local_features import find_features
+from relpose_ros.inference.matches import explain
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -33,7 +34,7 @@ class MatchedPairs:
     """Statistics of matched pairs and whether they were right."""
 
     predictors: FloatArray
-    """(Q, 3): log inliers, log share, planar."""
+    """(Q, 2), those of `relpose_ros.inference.matches.Support`."""
     right: npt.NDArray[np.bool_]
     """(Q,)."""
     errors: FloatArray
@@ -50,21 +51,20 @@ def observe(capture: Capture, *, masked: bool) -> MatchedPairs:
     predictors, right, errors, covariances = [], [], [], []
     for i in range(len(photos)):
         for j in range(i + 1, len(photos)):
-            found = relate(features[i], features[j])
-            if not found.poses:
+            explained = explain(features[i], features[j])
+            if explained is None:
                 continue
+            poses, _, support = explained
             truth = rotations[j] @ rotations[i].T
-            turns = [so3.log(truth @ pose.rotation.T) for pose in found.poses]
+            turns = [so3.log(truth @ pose.rotation.T) for pose in poses]
             best = int(np.argmin([np.linalg.norm(turn) for turn in turns]))
-            matches = len(match(features[i], features[j]))
-            inliers = len(found.inliers)
-            predictors.append([math.log(inliers), math.log(inliers / matches), float(len(found.poses) > 1)])
+            predictors.append(support.predictors)
             right.append(bool(np.linalg.norm(turns[best]) < RIGHT))
             if right[-1]:
                 errors.append(turns[best])
-                covariances.append(found.poses[best].covariance)
+                covariances.append(poses[best].covariance)
     return MatchedPairs(
-        np.array(predictors).reshape(-1, 3),
+        np.array(predictors).reshape(-1, 2),
         np.array(right, bool),
         np.array(errors).reshape(-1, 3),
         np.array(covariances).reshape(-1, 3, 3),
@@ -72,10 +72,10 @@ def observe(capture: Capture, *, masked: bool) -> MatchedPairs:
 
 
 def fit_trust(pairs: MatchedPairs) -> FloatArray:
-    """Logistic regression by Newton's method. -> (4,) bias and coefficients."""
+    """Logistic regression by Newton's method. -> (3,) bias and coefficients."""
     design = np.concatenate([np.ones((len(pairs.right), 1)), pairs.predictors], 1)
     coefficients = np.zeros(design.shape[1])
-    penalty = RIDGE * np.diag([0.0, 1.0, 1.0, 1.0])
+    penalty = RIDGE * np.diag([0.0, 1.0, 1.0])
     for _ in range(30):
         chance = 1 / (1 + np.exp(-design @ coefficients))
         slope = design.T @ (pairs.right - chance) - penalty @ coefficients

@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     FloatArray = npt.NDArray[np.float64]
 
 
+def homogeneous(rays: npt.ArrayLike) -> FloatArray:
+    """Rays (x / z, y / z) as points at depth 1. (..., 2) -> (..., 3)."""
+    r = np.asarray(rays, np.float64)
+    return np.concatenate([r, np.ones_like(r[..., :1])], -1)
+
+
 def camera_centre(camera_from_world: npt.ArrayLike, translation: npt.ArrayLike) -> FloatArray:
     """Where the camera stands in the world: ``-R^T t``. (..., 3, 3), (..., 3) -> (..., 3)."""
     r, t = np.asarray(camera_from_world, np.float64), np.asarray(translation, np.float64)

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import cv2
 import numpy as np
 
-from relpose_ros.views import Scan
+from relpose_ros.views import Intrinsics, Scan
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -22,8 +22,6 @@ PICTURE_SIDE = 208
 """Pixels of a view's small picture: sharp at the size the report shows it, on a dense screen too."""
 PICTURE_MARGIN = 1.15
 """How much more than the box a picture shows: as much as the network sees (RelPose++ crops)."""
-ASSUMED_FOCAL = 1.2
-"""Focal length in longer image sides where a camera said nothing: a phone's main camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +80,8 @@ def _record(view: View) -> ViewRecord:
     # Whole pixels, so that a cut without interpolation shows exactly what the corners' rays enclose.
     first = np.floor(centre - side / 2).astype(int)
     last = np.ceil(centre + side / 2).astype(int)
-    if view.intrinsics is not None:
-        focal = np.array([view.intrinsics.fx, view.intrinsics.fy])
-        principal = np.array([view.intrinsics.cx, view.intrinsics.cy])
-    else:
-        focal = np.full(2, ASSUMED_FOCAL * max(view.full_width, view.full_height))
-        principal = np.array([view.full_width, view.full_height]) / 2
+    camera = view.intrinsics or Intrinsics.guessed(view.full_width, view.full_height)
+    focal, principal = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     corners = np.array([[first[0], first[1]], [last[0], first[1]], [last[0], last[1]], [first[0], last[1]]])
     return ViewRecord(
         view=replace(view, image=np.empty((0, 0, 3), np.uint8), mask=None),

@@ -8,7 +8,8 @@ import pytest
 from relpose_ros.captures.folder import Frame, load_capture, save_capture
 from relpose_ros.evaluation.match_trust import RIGHT, MatchedPairs, fit_trust, observe
 from relpose_ros.geometry import so3
-from relpose_ros.inference.matches import find_features, relate, trust
+from relpose_ros.inference.local_features import find_features
+from relpose_ros.inference.matches import Support, relate, trust
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
 FOCAL, SIDE = 300.0, 160
@@ -60,21 +61,15 @@ def capture(textures, tmp_path_factory):
 
 def test_observes_the_pairs_whose_cameras_are_known(capture):
     pairs = observe(load_capture(capture.folder), masked=True)
-    assert pairs.predictors.shape == (3, 3)  # nothing matches the plain one
+    assert pairs.predictors.shape == (3, 2)  # nothing matches the plain one
     assert pairs.right.tolist() == [True, True, True]
     assert pairs.errors.shape == (3, 3)
     assert pairs.covariances.shape == (3, 3, 3)
     assert np.linalg.norm(pairs.errors, axis=1).max() < RIGHT
     found = relate(*(find_features(capture.view(k)) for k in (0, 1)))
     assert math.exp(pairs.predictors[0, 0]) == pytest.approx(len(found.inliers))
-    assert (pairs.predictors[:, 1] <= 0).all()
     # By the same predictors the matches say how far to trust themselves.
-    log_inliers, log_share, _ = pairs.predictors[0]
-    inliers = round(math.exp(log_inliers))
-    stated = {
-        trust(inliers, round(inliers / math.exp(log_share)), several=several) for several in (False, True)
-    }
-    assert found.probability in stated
+    assert found.probability == trust(Support(len(found.inliers), pairs.predictors[0, 1]))
 
 
 def test_a_wrong_pose_on_file_counts_as_wrong(capture, textures, tmp_path):
@@ -89,10 +84,8 @@ def test_a_wrong_pose_on_file_counts_as_wrong(capture, textures, tmp_path):
 
 def test_the_regression_finds_the_coefficients_of_its_own_kind():
     generator = np.random.default_rng(0)
-    coefficients = np.array([-6.0, 2.0, 1.0, -0.8])
-    predictors = np.stack(
-        [generator.uniform(2, 6, 8000), generator.uniform(-2, 0, 8000), generator.integers(0, 2, 8000)], 1
-    )
+    coefficients = np.array([-8.0, 2.0, 3.0])
+    predictors = np.stack([generator.uniform(2, 6, 8000), generator.uniform(0, 1, 8000)], 1)
     chance = 1 / (1 + np.exp(-(coefficients[0] + predictors @ coefficients[1:])))
     right = generator.uniform(size=8000) < chance
     none = np.zeros((0, 3))
@@ -105,7 +98,7 @@ def test_the_regression_finds_the_coefficients_of_its_own_kind():
 
 def test_few_pairs_make_nothing_certain():
     """Perfectly separable: without the ridge the coefficients would have no end."""
-    predictors = np.array([[2.0, -1, 0], [2.2, -1, 0], [4.0, -1, 0], [4.4, -1, 0]])
+    predictors = np.array([[2.0, 0.3], [2.2, 0.3], [4.0, 0.9], [4.4, 0.9]])
     right = np.array([False, False, True, True])
     none = np.zeros((0, 3))
     found = fit_trust(MatchedPairs(predictors, right, none, none[..., None]))

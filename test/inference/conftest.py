@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 import torch
 
 from relpose_ros.geometry import so3
-from relpose_ros.inference.matches import LocalFeatures
+from relpose_ros.inference.local_features import LocalFeatures
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
 PIXEL = 1 / 800
@@ -118,7 +118,7 @@ class PointScene:
         self, noise: float = 0.5, outliers: int = 0, seed: int = 0, guessed: bool = False
     ) -> list[LocalFeatures]:
         """One feature per point and view, the last ``outliers`` of them anywhere; noise in pixels."""
-        generator = np.random.default_rng([seed, 1])
+        generator, turning = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
         descriptors = generator.standard_normal((len(self.points), 128)).astype(np.float32)
         descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
         found = []
@@ -127,14 +127,35 @@ class PointScene:
             rays = local[:, :2] / local[:, 2:]
             rays = rays + noise * PIXEL * generator.standard_normal(rays.shape)
             rays[len(rays) - outliers :] = generator.uniform(-0.3, 0.3, (outliers, 2))
+            orientations = 0.2 * turning.standard_normal(len(rays))
+            orientations[len(rays) - outliers :] = turning.uniform(-np.pi, np.pi, outliers)
             order = generator.permutation(len(rays))
-            found.append(LocalFeatures(rays[order], descriptors[order], PIXEL, guessed))
+            places, plain = np.arange(len(rays)), len(rays)
+            found.append(
+                LocalFeatures(
+                    rays[order], orientations[order], descriptors[order], places, plain, PIXEL, guessed
+                )
+            )
         return found
 
 
 @pytest.fixture
 def point_scene() -> type[PointScene]:
     return PointScene
+
+
+@pytest.fixture
+def textured() -> object:
+    """Views that a blurred noise fills, another one for each seed."""
+    import cv2
+
+    def view(seed: int, height: int = 160, width: int = 200, **changes: object) -> View:
+        noise = np.random.default_rng(seed).standard_normal((height, width))
+        grey = np.clip(128 + 500 * cv2.GaussianBlur(noise, (0, 0), 2.5), 0, 255).astype(np.uint8)
+        image = np.repeat(grey[..., None], 3, -1)
+        return replace(View(image, BoundingBox(0, 0, width, height), width, height), **changes)
+
+    return view
 
 
 BALL_FOCAL, BALL_SIZE = 500.0, 240

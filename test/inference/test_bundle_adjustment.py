@@ -9,8 +9,9 @@ import pytest
 
 from relpose_ros.geometry import so3
 from relpose_ros.inference import bundle_adjustment
-from relpose_ros.inference.bundle_adjustment import LEAST_POINTS, _Observations, _Problem, refine
-from relpose_ros.inference.matches import NOTHING, RelativePose, TwoViewGeometry, match
+from relpose_ros.inference.bundle_adjustment import LEAST_POINTS, _Observations, _Problem, _State, refine
+from relpose_ros.inference.local_features import match
+from relpose_ros.inference.matches import NOTHING, RelativePose, TwoViewGeometry
 
 ANGLES = [0.0, 20.0, 40.0, 60.0]
 
@@ -208,25 +209,76 @@ def test_same_bits_twice(point_scene):
     assert first.translations.tobytes() == second.translations.tobytes()
 
 
-def test_the_jacobian_is_that_of_the_residuals(point_scene):
+@pytest.fixture
+def problem(point_scene):
+    """Three cameras that see eight points, all a little off, and its state."""
     scene = point_scene.ring(ANGLES[:3], points=8)
     camera, point = (each.reshape(-1) for each in np.meshgrid(np.arange(3), np.arange(8)))
     generator = np.random.default_rng(0)
     local = np.einsum("qab,qb->qa", scene.rotations[camera], scene.points[point]) + scene.translations[camera]
     rays = local[:, :2] / local[:, 2:] + 0.004 * generator.standard_normal((24, 2))
     seen = _Observations(camera, point, rays, np.full(24, 1 / 800))
-    poses = scene.rotations, scene.translations
-    problem = _Problem(poses, seen, 3.0, poses)
-    start = np.concatenate([np.zeros(12), scene.points.reshape(-1)])
-    jacobian = problem.jacobian(start).toarray()
-    assert jacobian.shape == (2 * 24 + 12, 12 + 24)
-    for column in range(len(start)):
-        step = np.zeros_like(start)
-        step[column] = 1e-6
-        slope = (problem.residuals(start + step) - problem.residuals(start - step)) / 2e-6
-        np.testing.assert_allclose(
-            jacobian[:, column], slope, rtol=1e-5, atol=1e-4 * max(1, np.abs(slope).max())
-        )
+    rotations, translations = perturbed(scene, degrees=0.5, shift=0.01)
+    state = _State(rotations, translations, scene.points + 0.01 * generator.standard_normal((8, 3)))
+    return _Problem(seen, 3.0, (scene.rotations, scene.translations)), state
+
+
+def moved(state, step):
+    """After steps of the cameras but the first (6 each), then of the points."""
+    turns, shifts = np.split(step[:12].reshape(2, 6), 2, 1)
+    rotations, translations = state.rotations.copy(), state.translations.copy()
+    rotations[1:] = so3.exp(turns) @ rotations[1:]
+    translations[1:] += shifts
+    return _State(rotations, translations, state.points + step[12:].reshape(-1, 3))
+
+
+def test_derivatives_are_those_of_the_cost(problem):
+    """The priors' turns are taken as small: without priors, exactly."""
+    problem, state = problem
+    problem._prior = state.rotations, state.translations
+    residuals, by_camera, by_point = problem.weighted(state)
+    slope = np.zeros((3, 6)), np.zeros((8, 3))
+    np.add.at(slope[0], problem._seen.camera, np.einsum("qak,qa->qk", by_camera, residuals))
+    np.add.at(slope[1], problem._seen.point, np.einsum("qak,qa->qk", by_point, residuals))
+    found = np.concatenate([slope[0][1:].reshape(-1), slope[1].reshape(-1)])
+    for column, step in enumerate(1e-6 * np.eye(36)):
+        ahead, behind = (problem.cost(moved(state, way)) for way in (step, -step))
+        assert found[column] == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-3)
+
+
+def test_a_step_solves_the_normal_equations_of_everything(problem):
+    """Eliminating the points gives what the whole system, put together and solved at once, gives."""
+    problem, state = problem
+    residuals, by_camera, by_point = problem.weighted(state)
+    jacobian, target = np.zeros((60, 36)), np.zeros(60)
+    for sighting, (camera, point) in enumerate(zip(problem._seen.camera, problem._seen.point, strict=True)):
+        rows = slice(2 * sighting, 2 * sighting + 2)
+        if camera > 0:
+            jacobian[rows, 6 * camera - 6 : 6 * camera] = by_camera[sighting]
+        jacobian[rows, 12 + 3 * point : 15 + 3 * point] = by_point[sighting]
+        target[rows] = residuals[sighting]
+    held = [1 / bundle_adjustment.ROTATION_DEVIATION] * 3 + [1 / bundle_adjustment.TRANSLATION_DEVIATION] * 3
+    jacobian[48:, :12] = np.diag(held * 2)
+    target[48:] = problem.prior_residuals(state).reshape(-1)
+    for damping in (1e-6, 0.5):
+        normal = jacobian.T @ jacobian
+        normal += damping * np.diag(np.diag(normal))
+        expected = moved(state, -np.linalg.solve(normal, jacobian.T @ target))
+        found = problem.stepped(state, damping)
+        np.testing.assert_allclose(found.rotations, expected.rotations, atol=1e-7)
+        np.testing.assert_allclose(found.translations, expected.translations, atol=1e-7)
+        np.testing.assert_allclose(found.points, expected.points, atol=1e-7)
+
+
+def test_from_far_off_in_a_narrow_view(point_scene):
+    """Nearly orthographic views, five times as narrow: a long valley to walk down."""
+    scene = point_scene.ring(ANGLES)
+    scene.points /= 5
+    features = scene.features(noise=0.1)
+    rotations, translations = perturbed(scene, degrees=4, shift=0.01)
+    found = refine(rotations, translations, features, geometries(scene, features))
+    assert rotation_error(rotations, scene) > 3.9
+    assert rotation_error(found.rotations, scene) < 0.7
 
 
 def test_the_points_say_nothing_of_where_all_cameras_are_and_of_their_unit(point_scene):

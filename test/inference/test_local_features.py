@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from relpose_ros.inference.local_features import LocalFeatures, find_features, match
+from relpose_ros.inference.matches import NOTHING, relate
+from relpose_ros.views import BoundingBox, Intrinsics, View
+
+
+def pixels(features, view):
+    """Where features are, in the full image."""
+    intrinsics = view.intrinsics or Intrinsics.guessed(view.full_width, view.full_height)
+    return features.rays * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
+
+
+def features_of(descriptors):
+    count = len(descriptors)
+    rays, orientations = np.zeros((count, 2)), np.zeros(count)
+    return LocalFeatures(rays, orientations, descriptors, np.arange(count), count, 1.0, False)
+
+
+# Which features belong together.
+
+
+def test_matches_are_mutual_and_distinct():
+    generator = np.random.default_rng(0)
+    descriptors = generator.standard_normal((6, 128)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    first = features_of(descriptors)
+    # The second view has 3, 1, 0 in that order, and 5 twice: what looks the same twice matches nothing.
+    second = features_of(descriptors[[3, 1, 0, 5, 5]])
+    assert match(first, second).tolist() == [[0, 2], [1, 1], [3, 0]]
+    assert match(second, first).tolist() == [[0, 3], [1, 1], [2, 0]]
+
+
+def test_of_two_that_resemble_one_the_nearer_matches():
+    generator = np.random.default_rng(1)
+    descriptors = generator.standard_normal((4, 128)).astype(np.float32)
+    descriptors[3] = descriptors[0] + 0.3 * descriptors[3]
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    first = features_of(descriptors[[3, 0, 1]])
+    second = features_of(descriptors[:3])
+    assert match(first, second).tolist() == [[1, 0], [2, 1]]
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_one_feature_cannot_be_distinct(count):
+    none = features_of(np.ones((count, 128), np.float32))
+    some = features_of(np.eye(5, 128, dtype=np.float32))
+    assert match(none, some).shape == (0, 2)
+    assert match(some, none).shape == (0, 2)
+
+
+def test_no_two_matches_are_of_the_same_places():
+    descriptors = np.eye(4, 128, dtype=np.float32)
+    twice = replace(features_of(descriptors), places=np.array([0, 1, 0, 3]))
+    assert match(twice, twice).tolist() == [[0, 0], [1, 1], [3, 3]]
+    # In one view alone the same place may match two.
+    assert match(twice, features_of(descriptors)).tolist() == [[0, 0], [1, 1], [2, 2], [3, 3]]
+
+
+def test_squeezed_features_match_plain_ones_not_each_other():
+    descriptors = np.eye(6, 128, dtype=np.float32)
+    first = replace(features_of(descriptors[:4]), plain=2)
+    second = replace(features_of(descriptors[[2, 5, 1, 3]]), plain=2)
+    assert match(first, second).tolist() == [[2, 0], [1, 2]]
+
+
+# Features of a picture.
+
+
+def test_features_lie_where_the_picture_has_them(textured):
+    """The same whether the part was shrunk, its sides to whole pixels that are not quite in proportion."""
+    view = textured(2, 612, 1187, intrinsics=Intrinsics(900, 910, 590, 310))
+    shrunk = find_features(view)
+    assert not shrunk.guessed
+    assert shrunk.pixel == pytest.approx(1187 / 800 / 905)
+    np.testing.assert_allclose(np.linalg.norm(shrunk.descriptors, axis=1), 1, atol=1e-5)
+    shifts = []
+    for top in (0, 452):
+        part = find_features(replace(view, box=BoundingBox(100, top, 500, top + 160)))
+        assert part.pixel == pytest.approx(1 / 2 / 905)
+        together = match(shrunk, part)
+        assert len(together) > 50
+        apart = (shrunk.rays[together[:, 0]] - part.rays[together[:, 1]]) * [900, 910]
+        shifts.append(np.median(apart, axis=0))
+    # SIFT itself has a bias of a quarter of a pixel of the picture it was given.
+    assert np.abs(shifts).max() < 0.4
+    assert abs(shifts[1][1] - shifts[0][1]) < 0.2
+
+
+def test_a_mirrored_picture_has_mirrored_features(textured):
+    """Pixels are counted from the first one's corner: what is at x comes to the width less x."""
+    view = textured(3)
+    mirrored = replace(view, image=np.ascontiguousarray(view.image[:, ::-1]))
+    places, others = (pixels(find_features(each), each) for each in (view, mirrored))
+    others[:, 0] = 200 - others[:, 0]
+    apart = np.linalg.norm(places[:, None] - others[None], axis=-1)
+    near = apart.min(1) < 1.5
+    assert near.sum() > 100
+    error = np.median((places - others[apart.argmin(1)])[near], axis=0) / 2
+    # The picture was enlarged by two, so that SIFT's own bias is an eighth of a pixel.
+    assert -0.03 < error[0] < 0.16
+
+
+def test_features_are_those_of_the_box(textured):
+    view = textured(0, box=BoundingBox(50, 40, 150, 120))
+    inside = pixels(find_features(view), view)
+    assert len(inside) > 20
+    assert (inside >= [50, 40]).all()
+    assert (inside <= [150, 120]).all()
+    everywhere = pixels(find_features(view, surroundings=True), view)
+    assert ((everywhere < [50, 40]) | (everywhere > [150, 120])).any(1).sum() > 20
+
+
+def test_features_are_those_of_the_mask(textured):
+    mask = np.zeros((160, 200), bool)
+    mask[30:130, 60:140] = True
+    view = textured(0, mask=mask)
+    inside = pixels(find_features(view), view)
+    assert len(inside) > 20
+    column, row = np.floor(inside).astype(int).T
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    assert near[row, column].all()
+    assert len(find_features(view, surroundings=True).rays) > len(inside)
+
+
+def test_a_crop_says_what_the_whole_picture_says(textured):
+    whole = textured(1, box=BoundingBox(60, 40, 160, 130), mask=np.ones((160, 200), bool))
+    crop = replace(whole, image=whole.image[30:140, 50:170], mask=whole.mask[30:140, 50:170], origin=(50, 30))
+    a, b = find_features(whole), find_features(crop)
+    assert len(a.rays) > 20
+    np.testing.assert_array_equal(a.rays, b.rays)
+    np.testing.assert_array_equal(a.descriptors, b.descriptors)
+    assert a.pixel == b.pixel
+
+
+def test_without_intrinsics_the_focal_length_is_guessed(textured):
+    view = textured(0)
+    features = find_features(view)
+    assert features.guessed
+    assert features.pixel == pytest.approx(1 / (2 * 1.2 * 200))
+    known = find_features(replace(view, intrinsics=Intrinsics(240, 240, 100, 80)))
+    assert not known.guessed
+    np.testing.assert_allclose(known.rays, features.rays)
+
+
+def test_a_surface_at_a_slant_matches(textured):
+    """A picture, and half its width: a surface turned by sixty degrees."""
+    view = textured(4, intrinsics=Intrinsics(300, 300, 100, 80))
+    narrow = np.ascontiguousarray(cv2.resize(view.image, (100, 160), interpolation=cv2.INTER_AREA))
+    slanted = View(narrow, BoundingBox(0, 0, 100, 160), 100, 160, intrinsics=Intrinsics(300, 300, 50, 80))
+    for pair in ((view, slanted), (slanted, view)):
+        features = [find_features(each) for each in pair]
+        together = match(*features)
+        places = [pixels(each, v)[m] for each, v, m in zip(features, pair, together.T, strict=True)]
+        wide, thin = places if pair[0] is view else places[::-1]
+        right = np.linalg.norm(wide * [0.5, 1] - thin, axis=1) < 1.5
+        squeezed = (together >= [each.plain for each in features]).any(1)
+        assert (right & squeezed).sum() > 30
+        assert (right & squeezed).sum() > 3 * (right & ~squeezed).sum()
+
+
+def test_a_feature_of_both_pictures_has_one_place(textured):
+    features = find_features(textured(5))
+    squeezed = np.arange(features.plain, len(features.rays))
+    shared = squeezed[features.places[squeezed] < features.plain]
+    assert len(shared) > 20
+    apart = np.linalg.norm(features.rays[shared] - features.rays[features.places[shared]], axis=1)
+    assert apart.max() <= 2.0001 * features.pixel
+    others = np.setdiff1d(squeezed, shared)
+    assert (features.places[others] >= features.plain).all()
+    np.testing.assert_array_equal(features.places[features.places], features.places)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (5, 3), (40, 60)])
+def test_pictures_without_features(size):
+    image = np.full((*size, 3), 128, np.uint8)
+    view = View(image, BoundingBox(0, 0, size[1], size[0]), size[1], size[0])
+    features = find_features(view)
+    assert features.rays.shape == (0, 2)
+    assert features.descriptors.shape == (0, 128)
+    assert relate(features, features) is NOTHING
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        BoundingBox(50, 50, 51, 51),
+        BoundingBox(50, 50, 50.2, 90),
+        BoundingBox(190, 150, 260, 220),
+        BoundingBox(300, 300, 320, 330),
+        BoundingBox(-40, -40, -10, -10),
+    ],
+)
+def test_a_box_with_hardly_a_pixel_has_no_features_of_elsewhere(textured, box):
+    view = textured(0, box=box)
+    found = pixels(find_features(view), view)
+    assert (found >= [box.x0 - 1, box.y0 - 1]).all()
+    assert (found <= [box.x1 + 1, box.y1 + 1]).all()
+
+
+def test_an_empty_mask_has_no_features(textured):
+    view = textured(0, mask=np.zeros((160, 200), bool))
+    assert len(find_features(view).rays) == 0
