@@ -1,4 +1,4 @@
-"""The command line: ``relpose_ros {node, replay, pack, render, train, evaluate, convert}``.
+"""The command line: ``relpose_ros {node, replay, pack, evaluate, calibrate, render, shard, train, convert}``.
 
 Each command is a few lines into a function that a program could call as well. What a command needs is
 imported when it runs, so that ``relpose_ros replay`` works without ROS and ``--help`` is quick.
@@ -112,13 +112,7 @@ def _parser() -> argparse.ArgumentParser:
         _evaluate,
         "Measure poses on captures that have them, by the paper's protocol, beside baselines.",
     )
-    evaluate.add_argument(
-        "capture",
-        type=Path,
-        nargs="+",
-        help="capture folder with camera poses; bag with a topic ground_truth/pose; category of CO3Dv2, or "
-        "the folder of all categories",
-    )
+    _add_captures(evaluate)
     evaluate.add_argument(
         "--views",
         type=_view_counts,
@@ -139,17 +133,6 @@ def _parser() -> argparse.ArgumentParser:
         "name, such as regression; again for more",
     )
     evaluate.add_argument(
-        "--no-masks", action="store_true", help="give the boxes alone, as where nobody segmented the object"
-    )
-    evaluate.add_argument(
-        "--split",
-        choices=("held_out", "train"),
-        default="held_out",
-        help="which categories of CO3Dv2, where a folder holds them all: the paper's ten that training does "
-        "not see (default), or the others",
-    )
-    _add_topics(evaluate)
-    evaluate.add_argument(
         "--orders",
         type=int,
         default=5,
@@ -159,6 +142,26 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--seed", type=int, default=0, help="seed of those orders (default: 0)")
     evaluate.add_argument("--output", type=Path, metavar="FILE", help="JSON file for the rows")
     _add_weights(evaluate)
+
+    calibrate = command(
+        "calibrate",
+        _calibrate,
+        "Fit how far a network's probabilities hold on captures it was not trained on, and store it with the "
+        "weights.",
+    )
+    calibrate.add_argument("weights", type=_home_path, metavar="WEIGHTS", help="as of --weights elsewhere")
+    _add_captures(calibrate)
+    calibrate.add_argument(
+        "--output", type=_home_path, required=True, metavar="FILE", help="safetensors file to write"
+    )
+    calibrate.add_argument(
+        "--scans",
+        type=int,
+        metavar="K",
+        help="scans to fit on, and as many to measure on, of all that a path holds (default: 24)",
+    )
+    calibrate.add_argument("--seed", type=int, default=0, help="of the scans (default: 0)")
+    calibrate.add_argument("--half", action="store_true", help="write the weights in float16, half as large")
 
     render = command(
         "render",
@@ -191,6 +194,36 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument(
         "--processes", type=int, default=1, metavar="K", help="processes that render shards (default: 1)"
     )
+
+    shard = command(
+        "shard", _shard, "Cut photos of captures with poses into shards of crops for the trainer."
+    )
+    shard.add_argument(
+        "capture",
+        type=Path,
+        nargs="+",
+        help="capture folder, or a folder of such; category of CO3Dv2, or the folder of all categories",
+    )
+    shard.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to write into")
+    shard.add_argument(
+        "--preset", choices=sorted(PRESETS), default="compact", help="for which network (default: compact)"
+    )
+    shard.add_argument(
+        "--copies",
+        type=int,
+        default=1,
+        metavar="K",
+        help="crops of each photo, each with a jitter of its own (default: 1)",
+    )
+    shard.add_argument(
+        "--masked-copies",
+        type=int,
+        default=0,
+        metavar="K",
+        help="how many of them show the object alone, where there are masks (default: 0)",
+    )
+    _add_split(shard, "train")
+    shard.add_argument("--seed", type=int, default=0, help="of the jitter (default: 0)")
 
     train = command(
         "train", _train, "Train a network on rendered shards, or go on with a run that was stopped."
@@ -268,6 +301,31 @@ def _add_weights(parser: argparse.ArgumentParser) -> None:
         type=_home_path,
         metavar="FILE",
         help="network weights: safetensors or a released checkpoint (default: the compact ones that ship)",
+    )
+
+
+def _add_captures(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "capture",
+        type=Path,
+        nargs="+",
+        help="capture folder with camera poses, or a folder of such; bag with a topic ground_truth/pose; "
+        "category of CO3Dv2, or the folder of all categories",
+    )
+    parser.add_argument(
+        "--no-masks", action="store_true", help="give the boxes alone, as where nobody segmented the object"
+    )
+    _add_split(parser, "held_out")
+    _add_topics(parser)
+
+
+def _add_split(parser: argparse.ArgumentParser, default: str) -> None:
+    parser.add_argument(
+        "--split",
+        choices=("held_out", "train"),
+        default=default,
+        help="which categories of CO3Dv2, where a folder holds them all: the paper's ten that training does "
+        f"not see, or the others (default: {default})",
     )
 
 
@@ -361,6 +419,22 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _calibrate(arguments: argparse.Namespace) -> int:
+    from relpose_ros.evaluation.calibrate import SCANS, calibrate, calibration_table
+
+    calibration, reports = calibrate(
+        {str(path): list(_posed_views(path, arguments)) for path in arguments.capture},
+        arguments.weights,
+        arguments.output,
+        scans=SCANS if arguments.scans is None else arguments.scans,
+        seed=arguments.seed,
+        half=arguments.half,
+    )
+    print(f"{calibration.to_json()}\n\nOn other scans, uncalibrated -> calibrated:\n")
+    print(calibration_table(reports))
+    return 0
+
+
 def _posed_views(path: Path, arguments: argparse.Namespace) -> Iterator[PosedViews]:
     """What is measured on at a place: of a bag each object, else each capture."""
     from relpose_ros.captures.opening import open_captures
@@ -415,6 +489,21 @@ def _render_demo_bags(output: Path) -> int:
         for demo in render_demo_captures(Path(folder)):
             name, period_s = demo.name, demo.period_s
             pack(Path(folder, name), output / name, form=demo.form, object_id=name, period_s=period_s)
+    return 0
+
+
+def _shard(arguments: argparse.Namespace) -> int:
+    from relpose_ros.captures.opening import open_captures
+    from relpose_ros.training.photographs import write_capture_shards
+
+    write_capture_shards(
+        arguments.output,
+        (capture for path in arguments.capture for capture in open_captures(path, arguments.split)),
+        PRESETS[arguments.preset],
+        arguments.copies,
+        masked_copies=arguments.masked_copies,
+        seed=arguments.seed,
+    )
     return 0
 
 

@@ -12,11 +12,12 @@ import pytest
 from relpose_ros import cli
 from relpose_ros.captures.folder import Frame, save_capture
 from relpose_ros.geometry.cameras import look_at, translation_of
-from relpose_ros.network.checkpoint import random_network, write_network
+from relpose_ros.network.checkpoint import random_network, read_metadata, write_network
 from relpose_ros.network.presets import named_preset
+from relpose_ros.training.batches import open_scans
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
-COMMANDS = ("node", "replay", "pack", "evaluate", "render", "train", "convert")
+COMMANDS = ("node", "replay", "pack", "evaluate", "calibrate", "render", "shard", "train", "convert")
 
 
 @pytest.fixture
@@ -175,6 +176,22 @@ def test_a_capture_becomes_a_bag_an_estimate_and_a_row(tmp_path, posed_capture, 
         [next(r for r in of_capture if (r["method"], r["views"]) == ("identity", 3))[key] for key in whole],
         abs=1e-4,
     )
+
+
+def test_weights_are_calibrated_on_captures_and_bags(tmp_path, posed_capture, random_weights, capsys):
+    bag, output = tmp_path / "bag", tmp_path / "calibrated.safetensors"
+    assert cli.main(["pack", str(posed_capture), "--output", str(bag)]) == 0
+    command = ["calibrate", str(random_weights), str(posed_capture), str(bag), "--output", str(output)]
+    assert cli.main([*command, "--scans", "1", "--half"]) == 0
+    assert "calibration" in read_metadata(output)
+    assert output.stat().st_size < 0.6 * random_weights.stat().st_size
+    assert 'calibration error of "within 15 degrees"' in capsys.readouterr().out
+
+
+def test_captures_become_shards(tmp_path, posed_capture):
+    shards = tmp_path / "shards"
+    assert cli.main(["shard", str(posed_capture.parent), "--output", str(shards), "--copies", "2"]) == 0
+    assert len(open_scans([shards])) == 2
 
 
 def test_variants_masks_and_categories_of_co3d(tmp_path, write_category, capsys):

@@ -1,4 +1,4 @@
-"""Captures of whatever kind a folder holds: one of our own, or CO3Dv2."""
+"""Captures of whatever kind a folder holds: one of our own, several, or CO3Dv2."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def open_captures(folder: Path, split: Split = "held_out") -> Iterator[Capture]:
     """Every capture of a folder, in order of the names.
 
     Args:
-        folder: A capture folder, a category of CO3Dv2, or the folder of all categories.
+        folder: A capture folder or a folder of such, a category of CO3Dv2, or the folder of all categories.
         split: Which of these are meant then, where they are there.
 
     Raises:
@@ -34,6 +34,9 @@ def open_captures(folder: Path, split: Split = "held_out") -> Iterator[Capture]:
     if not folder.is_dir() or (folder / LISTING).exists():
         yield load_capture(folder)
         return
+    if inside := sorted(each.parent for each in folder.glob(f"*/{LISTING}")):
+        yield from map(load_capture, inside)
+        return
     if (folder / FRAME_ANNOTATIONS).exists():
         categories = [folder.resolve()]
     else:
@@ -41,8 +44,8 @@ def open_captures(folder: Path, split: Split = "held_out") -> Iterator[Capture]:
         here = [each.parent for each in sorted(folder.resolve().glob(f"*/{FRAME_ANNOTATIONS}"))]
         if not here:
             text = (
-                f"{folder} is neither a capture, which has {LISTING}, nor a category or the folder of all "
-                f"categories of CO3Dv2, which have {FRAME_ANNOTATIONS}."
+                f"{folder} is neither a capture, which has {LISTING}, nor a folder of such, nor a category "
+                f"or the folder of all categories of CO3Dv2, which have {FRAME_ANNOTATIONS}."
             )
             raise CaptureError(text)
         categories = [each for each in here if each.name in names]

@@ -241,6 +241,12 @@ class Estimator:
             ]
 
     @torch.no_grad()
+    def features(self, scan: Scan) -> SceneFeatures:
+        """What the network sees in the views, each looked at once and kept as long as the view is."""
+        with self._lock:
+            return self._features(scan)
+
+    @torch.no_grad()
     def rotations(self, features: SceneFeatures) -> FloatArray:
         """The jointly best rotations, camera_from_object, the first the identity. -> (N, 3, 3)."""
         if self._regresses:

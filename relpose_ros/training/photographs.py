@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
+import zlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from relpose_ros.captures.scans import PLACE_STRIDE
 from relpose_ros.errors import RelPoseError
 from relpose_ros.network.crops import IMAGE_MEAN, IMAGE_STD, crop_view
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     import numpy.typing as npt
@@ -88,7 +92,50 @@ def write_capture_shard(folder: Path, shard: dict[str, npt.NDArray[Any]]) -> Non
         shard: From `capture_shard`.
     """
     partial = folder.with_name(folder.name + ".unfinished")
+    shutil.rmtree(partial, ignore_errors=True)  # of a run that was cut off
     partial.mkdir(parents=True)
     for name, array in shard.items():
         np.save(partial / f"{name}.npy", array)
     partial.rename(folder)
+
+
+def write_capture_shards(
+    folder: Path,
+    captures: Iterable[Capture],
+    preset: Preset,
+    copies: int,
+    *,
+    masked_copies: int = 0,
+    seed: int = 0,
+) -> int:
+    """Write a shard of each capture, with a progress bar; those that stand already are left alone.
+
+    Args:
+        folder: Gets a sub-folder per capture, named as it is.
+        captures: Read one after the other. Their names draw the jitter, together with the seed.
+        preset: See `capture_shard`, like the rest.
+        copies: Of each photo.
+        masked_copies: How many of them show the object alone.
+        seed: Of the jitter.
+
+    Returns:
+        How many captures there were.
+
+    Raises:
+        CaptureShardError: There are no copies to make, or two captures have one name.
+    """
+    if copies < 1 or not 0 <= masked_copies <= copies:
+        text = f"{copies} copies, {masked_copies} of them masked, cannot be made; ask for 1 or more."
+        raise CaptureShardError(text)
+    written: set[str] = set()
+    for capture in tqdm(captures, unit="capture"):
+        if capture.name in written:
+            text = f"two captures are called {capture.name}; rename the folder of one, {capture.folder}."
+            raise CaptureShardError(text)
+        written.add(capture.name)
+        if (folder / capture.name).exists():
+            continue
+        own_seed = zlib.crc32(f"{seed} {capture.name}".encode())
+        shard = capture_shard(capture, preset, copies, masked_copies=masked_copies, seed=own_seed)
+        write_capture_shard(folder / capture.name, shard)
+    return len(written)

@@ -12,10 +12,12 @@ def names(folder, *split):
     return [capture.name for capture in open_captures(folder, *split)]
 
 
-def test_a_capture_folder_is_itself(tmp_path):
+def test_a_capture_folder_is_itself_and_a_folder_of_such_is_all_of_them(tmp_path):
     view = View(np.zeros((20, 30, 3), np.uint8), BoundingBox(2, 2, 18, 18), 30, 20)
     save_capture(tmp_path / "cup", [Frame(view)])
+    save_capture(tmp_path / "axe", [Frame(view)])
     assert names(tmp_path / "cup") == ["cup"]
+    assert names(tmp_path) == ["axe", "cup"]
 
 
 def test_a_category_gives_its_sequences_and_the_dataset_those_of_a_split(
@@ -34,7 +36,9 @@ def test_a_category_gives_its_sequences_and_the_dataset_those_of_a_split(
 def test_what_is_nothing_of_the_kind_is_refused_in_a_sentence(tmp_path, write_category):
     with pytest.raises(CaptureError, match="is no folder"):
         names(tmp_path / "missing")
-    with pytest.raises(CaptureError, match=r"neither a capture, which has cameras\.json, nor a category"):
+    with pytest.raises(
+        CaptureError, match=r"neither a capture, which has cameras\.json, nor a folder of such, nor"
+    ):
         names(tmp_path)
     write_category(tmp_path, "cup", ["5_5_5"], frames=1)
     with pytest.raises(CaptureError, match="holds no sequence with two frames"):

@@ -6,8 +6,13 @@ import pytest
 from relpose_ros.captures.folder import Frame, save_capture
 from relpose_ros.captures.shards import read_shard
 from relpose_ros.geometry import so3
-from relpose_ros.training.batches import FIELDS, Scans
-from relpose_ros.training.photographs import CaptureShardError, capture_shard, write_capture_shard
+from relpose_ros.training.batches import FIELDS, Scans, open_scans
+from relpose_ros.training.photographs import (
+    CaptureShardError,
+    capture_shard,
+    write_capture_shard,
+    write_capture_shards,
+)
 from relpose_ros.views import BoundingBox, View
 
 
@@ -50,3 +55,23 @@ def test_a_capture_without_poses_is_refused(capture, tiny_preset, tmp_path):
     lone = save_capture(tmp_path / "lone", [frame, frame])
     with pytest.raises(CaptureShardError, match="0 photos"):
         capture_shard(lone, tiny_preset, 2)
+
+
+def test_shards_of_many_captures_go_on_where_they_were_cut_off(capture, tiny_preset, tmp_path):
+    folder = tmp_path / "shards"
+    other = save_capture(tmp_path / "other", [Frame(capture.view(k), np.eye(3, 4)) for k in (0, 2)])
+    (folder / "other.unfinished").mkdir(parents=True)
+    assert write_capture_shards(folder, [capture], tiny_preset, 2, seed=1) == 1
+    first = read_shard(folder / "capture")
+    assert write_capture_shards(folder, [capture, other], tiny_preset, 2, seed=2) == 2
+    assert {path.name for path in folder.iterdir()} == {"capture", "other"}
+    assert len(open_scans([folder])) == 4
+    np.testing.assert_array_equal(read_shard(folder / "capture")["images"], first["images"])
+
+
+def test_shards_that_cannot_be_made(capture, tiny_preset, tmp_path):
+    for copies, masked in ((0, 0), (2, 3), (1, -1)):
+        with pytest.raises(CaptureShardError, match="cannot be made"):
+            write_capture_shards(tmp_path / "a", [capture], tiny_preset, copies, masked_copies=masked)
+    with pytest.raises(CaptureShardError, match="two captures are called capture"):
+        write_capture_shards(tmp_path / "b", [capture, capture], tiny_preset, 1)

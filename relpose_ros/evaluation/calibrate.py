@@ -1,0 +1,152 @@
+"""Fitting what turns a network's energies into probabilities that hold, on captures it was not trained on."""
+
+from __future__ import annotations
+
+from itertools import cycle, islice
+from typing import TYPE_CHECKING
+
+from relpose_ros.evaluation.protocol import EvaluationError, view_orders
+from relpose_ros.inference.calibration import (
+    LEVELS,
+    Calibration,
+    fit_calibration,
+    measure_calibration,
+    observe,
+)
+from relpose_ros.inference.estimator import Estimator
+from relpose_ros.inference.pair_energies import GridEmbeddings
+from relpose_ros.inference.predictions import predicted_translations
+from relpose_ros.network.checkpoint import load_network, read_metadata, write_network
+from relpose_ros.views import Scan
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from relpose_ros.evaluation.protocol import PosedViews
+    from relpose_ros.inference.calibration import CalibrationReport, Observation
+    from relpose_ros.network.relpose import RelPose
+
+VIEWS = (3, 4, 5, 8)
+"""Numbers of views that take turns; fewer where a capture has fewer."""
+SCANS = 24
+"""A group, to fit on; as many others to measure on."""
+
+Reports = dict[str, tuple["CalibrationReport", "CalibrationReport"]]
+"""By group: uncalibrated and calibrated."""
+
+
+def calibrate(
+    groups: Mapping[str, Sequence[PosedViews]],
+    weights: Path,
+    output: Path,
+    *,
+    scans: int = SCANS,
+    seed: int = 0,
+    half: bool = False,
+    progress: bool = True,
+) -> tuple[Calibration, Reports]:
+    """Fits a calibration, measures it on other scans of the same captures, and stores it with the weights.
+
+    Args:
+        groups: Captures by a name. All groups count the same, and so do the captures within one.
+        weights: Network file to calibrate; a calibration that it holds is not looked at.
+        output: Safetensors file to write, with all else that ``weights`` says of itself.
+        scans: Of each group, to fit on, and again to measure on.
+        seed: Of the scans.
+        half: Write the weights in float16.
+        progress: Whether to show a progress bar on stderr.
+
+    Raises:
+        EvaluationError: No captures or no scans, no folder for the output, or a network that regresses
+            poses, which has no probabilities.
+        NetworkFileError: Weights cannot be loaded or written.
+    """
+    from tqdm import tqdm
+
+    if not groups or not all(groups.values()):
+        raise EvaluationError("no capture was given to calibrate on; name at least one with camera poses.")
+    if scans < 1:
+        raise EvaluationError(f"{scans} scans of each are no number to fit on; ask for 1 or more.")
+    if not output.parent.is_dir():
+        raise EvaluationError(f"{output} cannot be written: {output.parent} is no folder; make it first.")
+    network = load_network(weights)
+    if network.preset.rotation == "regression":
+        text = f"{weights} regresses poses and states no probabilities; there is nothing to calibrate."
+        raise EvaluationError(text)
+    fitted_on: list[Observation] = []
+    others: dict[str, list[Observation]] = {}
+    with tqdm(total=2 * scans * len(groups), unit="scan", disable=not progress) as bar:
+        observed = _observer(network, bar.update)
+        for name, captures in groups.items():
+            bar.set_postfix_str(name)
+            drawn = _scans(captures, seed)
+            fitted_on += [observed(*scan) for scan in islice(drawn, scans)]
+            others[name] = [observed(*scan) for scan in islice(drawn, scans)]
+    calibration = fit_calibration(fitted_on)
+    metadata = {**read_metadata(weights), "calibration": calibration.to_json()}
+    write_network(network, output, metadata, half=half)
+    reports = {
+        name: (measure_calibration(group, Calibration()), measure_calibration(group, calibration))
+        for name, group in others.items()
+    }
+    return calibration, reports
+
+
+def _scans(captures: Sequence[PosedViews], seed: int) -> Iterator[tuple[PosedViews, list[int]]]:
+    """Endless scans, the captures in turn, each time round with the next number of views."""
+    for turn, count in enumerate(cycle(VIEWS)):
+        for capture in captures:
+            size = len(capture.camera_from_world)
+            (order,) = view_orders(capture.name, size, count, orders=1, seed=seed * 1_000_003 + turn)
+            yield capture, order
+
+
+def _observer(
+    network: RelPose, on_scan: Callable[[], object]
+) -> Callable[[PosedViews, list[int]], Observation]:
+    estimator, grid = Estimator(network), GridEmbeddings(network)
+
+    def observed(capture: PosedViews, order: list[int]) -> Observation:
+        views = tuple(capture.view(k) for k in order)
+        features = estimator.features(Scan(capture.name, views))
+        poses = capture.camera_from_world[order]
+        translations = predicted_translations(network, features, poses[:, :, :3] @ poses[0, :, :3].T)
+        on_scan()
+        return observe(network, grid, features, translations, poses[:, :, :3], poses[:, :, 3])
+
+    return observed
+
+
+def calibration_table(reports: Reports) -> str:
+    """What the calibration is worth, as text for a terminal: before -> after, a column a group."""
+    rows: dict[str, list[str]] = {"": list(reports)}
+    for before, after in reports.values():
+        for label, old, new in zip(_LABELS, _figures(before), _figures(after), strict=True):
+            rows.setdefault(label, []).append(old if old == new else f"{old} -> {new}")
+    widths = [max(map(len, column)) for column in zip(*([k, *v] for k, v in rows.items()), strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip([label, *cells], widths, strict=True)).rstrip()
+        for label, cells in rows.items()
+    )
+
+
+_ELLIPSOIDS = f"inside the {' / '.join(f'{100 * level:g}' for level in LEVELS)} % ellipsoid, %"
+_LABELS = (
+    "pairs",
+    "log density of the true rotation, nats above uniform",
+    'calibration error of "within 15 degrees"',
+    f"pairs {_ELLIPSOIDS}",
+    f"camera rotations {_ELLIPSOIDS}",
+    f"camera positions {_ELLIPSOIDS}",
+)
+
+
+def _figures(report: CalibrationReport) -> tuple[str, ...]:
+    coverages = (report.pair_coverage, report.camera_rotation_coverage, report.camera_position_coverage)
+    return (
+        str(report.pairs),
+        f"{report.log_likelihood:.2f}",
+        f"{report.expected_calibration_error:.3f}",
+        *(" / ".join(f"{100 * share:.0f}" for share in each) for each in coverages),
+    )

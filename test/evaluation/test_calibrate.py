@@ -1,0 +1,102 @@
+"""A network's calibration is fitted on posed captures and kept with its weights."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from relpose_ros.evaluation.calibrate import VIEWS, calibrate, calibration_table
+from relpose_ros.evaluation.protocol import EvaluationError, PosedViews
+from relpose_ros.geometry.cameras import look_at, translation_of
+from relpose_ros.inference.calibration import Calibration
+from relpose_ros.network.checkpoint import load_network, random_network, read_metadata, write_network
+from relpose_ros.network.presets import named_preset
+from relpose_ros.views import BoundingBox, View
+
+
+class Posed:
+    """A capture of noise, and which of its views were asked for."""
+
+    def __init__(self, name, count, seed):
+        generator = np.random.default_rng(seed)
+        centres = generator.normal(size=(count, 3))
+        centres *= 3 / np.linalg.norm(centres, axis=1, keepdims=True)
+        rotations = look_at(centres, np.zeros(3))
+        poses = np.concatenate([rotations, translation_of(rotations, centres)[..., None]], -1)
+        images = generator.integers(0, 256, (count, 32, 32, 3), dtype=np.uint8)
+        self.asked = []
+
+        def view(k):
+            self.asked.append(k)
+            return View(images[k], BoundingBox(4, 4, 28, 28), 32, 32)
+
+        self.views = PosedViews(name, poses, view)
+
+
+@pytest.fixture
+def overconfident(tmp_path):
+    """Weights of a network that knows nothing and is sure of it."""
+    network = random_network("compact", 0)
+    with torch.no_grad():
+        network.layers[4].weight *= 200
+    file = tmp_path / "sure.safetensors"
+    write_network(network, file, {"source": "a test", "images_seen": "12", "calibration": "{}"})
+    return file
+
+
+def test_a_sure_and_ignorant_network_becomes_modest(overconfident, tmp_path):
+    output = tmp_path / "modest.safetensors"
+    calibration, reports = calibrate(
+        {"noise": [Posed("noise", 9, 0).views]}, overconfident, output, scans=1, progress=False
+    )
+    before, after = reports["noise"]
+    assert before.pairs == math.comb(VIEWS[1], 2)
+    assert before.log_likelihood < -1
+    assert after.log_likelihood > before.log_likelihood + 1
+    assert after.log_likelihood > -0.3
+    assert "noise" in calibration_table(reports)
+
+    metadata = read_metadata(output)
+    assert Calibration.from_json(metadata["calibration"]) == calibration != Calibration()
+    assert (metadata["source"], metadata["images_seen"]) == ("a test", "12")
+    for name, tensor in load_network(overconfident).state_dict().items():
+        torch.testing.assert_close(load_network(output).state_dict()[name], tensor, rtol=0, atol=0)
+
+
+def test_groups_count_the_same_however_many_captures_they_have(overconfident, tmp_path):
+    many, one = [Posed(f"capture {k}", 4, k) for k in range(2)], Posed("alone", 4, 9)
+    groups = {"many": [each.views for each in many], "one": [one.views]}
+    _, reports = calibrate(
+        groups, overconfident, tmp_path / "a.safetensors", scans=2, half=True, progress=False
+    )
+    assert [len(each.asked) for each in many] == [3 + 4] * 2  # twice round
+    assert len(one.asked) == 3 + 4 + 4 + 4  # four times, with four views where it should be more
+    assert reports.keys() == groups.keys()
+
+
+@pytest.mark.parametrize(
+    ("groups", "scans", "told"),
+    [
+        ({}, 1, "no capture"),
+        ({"empty": []}, 1, "no capture"),
+        ({"x": [Posed("x", 3, 0).views]}, 0, "0 scans"),
+    ],
+)
+def test_nothing_to_fit_on(groups, scans, told, overconfident, tmp_path):
+    with pytest.raises(EvaluationError, match=told):
+        calibrate(groups, overconfident, tmp_path / "out.safetensors", scans=scans, progress=False)
+
+
+def test_a_network_without_probabilities(tmp_path):
+    file = tmp_path / "regression.safetensors"
+    write_network(random_network(named_preset("compact", ["regression"]), 0), file)
+    with pytest.raises(EvaluationError, match="regresses poses"):
+        calibrate({"x": [Posed("x", 3, 0).views]}, file, tmp_path / "out.safetensors", progress=False)
+
+
+def test_where_nothing_can_be_written_nothing_is_done(overconfident, tmp_path):
+    posed = Posed("x", 3, 0)
+    with pytest.raises(EvaluationError, match="no folder"):
+        calibrate({"x": [posed.views]}, overconfident, tmp_path / "no" / "out.safetensors", progress=False)
+    assert not posed.asked
