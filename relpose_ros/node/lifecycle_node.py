@@ -281,17 +281,8 @@ class ScanNode(LifecycleNode):
         return TransitionCallbackReturn.FAILURE
 
     def _load_estimator(self) -> Estimator:
-        settings, weights = self._settings, self._settings.weights_path
-        self.get_logger().info(f"Loading {weights or 'the shipped weights'}.")
-        # Imported here, as is all that needs PyTorch: that takes seconds, in which a signal must be heard.
-        from relpose_ros.inference.estimator import Estimator
-
-        return Estimator.from_weights(
-            weights,
-            settings.threads or None,
-            settings.evidence_settings,
-            backbone_in_bfloat16=settings.precision == "bfloat16",
-        )
+        self.get_logger().info(f"Loading {self._settings.weights_path or 'the shipped weights'}.")
+        return self._settings.load_estimator()
 
     def _make_outputs(self) -> None:
         for name, message_type in OUTPUTS:

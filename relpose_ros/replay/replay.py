@@ -94,7 +94,7 @@ def replay(
         truth = read_true_poses(reader)
         _check_writable(output)  # before the long part
         if estimator is None:
-            estimator = _learned_estimator(weights, settings)
+            estimator = settings.load_estimator(weights)
         scanner = Scanner(estimator, settings)
         recordings: dict[str, Recording] = {}
         rejections: Counter[str] = Counter()
@@ -148,18 +148,6 @@ def replay(
             *(len(recording.views), np.mean([each.estimate.seconds for each in recording.estimates])),
             last.status,
         )
-
-
-def _learned_estimator(weights: Path | None, settings: ScanSettings) -> SupportsEstimate:
-    from relpose_ros.inference.estimator import Estimator
-
-    chosen = weights or settings.weights_path
-    return Estimator.from_weights(
-        chosen,
-        settings.threads or None,
-        settings.evidence_settings,
-        backbone_in_bfloat16=settings.precision == "bfloat16",
-    )
 
 
 def _cells(

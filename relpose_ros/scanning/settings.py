@@ -20,6 +20,8 @@ from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from relpose_ros.inference.estimator import Estimator
+
 MAX_NAME_LENGTH = 128
 """Longest object id or frame name, characters: a longer one is garbage, and would go out in every message."""
 
@@ -182,6 +184,26 @@ class ScanSettings:
             use=cast("Any", self.evidence),
             surroundings=self.surroundings,
             first_view_distance=self.first_view_distance,
+        )
+
+    def load_estimator(self, weights: Path | None = None) -> Estimator:
+        """The estimator that these settings ask for.
+
+        Args:
+            weights: of another network than that of the settings.
+
+        Raises:
+            SettingsError: As `weights_path`.
+            NetworkFileError: The weights are missing or none of ours.
+        """
+        # Here, because PyTorch takes seconds, in which a node must hear signals.
+        from relpose_ros.inference.estimator import Estimator
+
+        return Estimator.from_weights(
+            weights or self.weights_path,
+            self.threads or None,
+            self.evidence_settings,
+            backbone_in_bfloat16=self.precision == "bfloat16",
         )
 
     @property

@@ -186,7 +186,8 @@ class Trainer:
             self._objective.compile()
         self.step = 0
         self.images = 0
-        self._began = 0
+        self._began: int | None = None
+        """Images that the weights had seen which were given to begin with; None: they were random."""
         self._seconds = 0.0
         if (folder / "checkpoint.json").exists():
             self._resume()
@@ -258,7 +259,7 @@ class Trainer:
         seen = batch.images.shape[0] * batch.images.shape[1] * self._processes
         self.images += seen
         keep = float(np.exp(-seen / settings.average_images))
-        if not self._began:
+        if self._began is None:
             # Young weights are forgotten sooner, or the average would keep the random ones.
             keep = min(self.step / (self.step + 10), keep)
         with torch.no_grad():
@@ -268,7 +269,7 @@ class Trainer:
     def learning_rate(self) -> float:
         """Of the coming step: a linear rise, a plateau, a linear fall to 0."""
         s = self.settings
-        rise = min(1.0, (self.images - self._began + s.batch_images) / max(s.warmup_images, 1))
+        rise = min(1.0, (self.images - (self._began or 0) + s.batch_images) / max(s.warmup_images, 1))
         left = 1 - self.images / s.images
         return s.learning_rate * rise * (min(1.0, left / s.decay) if s.decay > 0 else 1.0)
 
@@ -321,7 +322,7 @@ class Trainer:
         self._optimizer.load_state_dict(state["optimizer"])
         self._scaler.load_state_dict(state["scaler"])
         self.step, self.images, self._seconds = state["step"], state["images"], state["seconds"]
-        self._began = state.get("began", 0)
+        self._began = state["began"]
         if self._rank == 0:
             _cut_curve(self.folder / CURVE, self.step)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from relpose_ros.network.checkpoint import load_network, read_metadata
+from relpose_ros.network.checkpoint import load_network, random_network, read_metadata, write_network
 from relpose_ros.network.presets import PRESETS, VARIANTS, PresetError
 from relpose_ros.training import trainer
 from relpose_ros.training.batches import Augmentation, Scans
@@ -93,6 +93,15 @@ def test_a_run_begins_with_the_weights_it_is_given_and_counts_on(tmp_path, scans
     assert resumed.images == second.images
     assert resumed.learning_rate() == second.learning_rate()
     assert int(read_metadata(tmp_path / "second" / trainer.WEIGHTS)["images_seen"]) == second.images
+
+
+def test_given_weights_that_do_not_say_what_they_saw_are_kept_all_the_same(tmp_path, scans):
+    given = tmp_path / "released.safetensors"
+    write_network(random_network(SETTINGS.network, 3), given)
+    run = Trainer(SETTINGS, tmp_path / "run", scans, start_from=given)
+    before = weights(run.average)
+    run.train_step()
+    assert 0 < (weights(run.average) - before).norm() < 0.01 * (weights(run.network) - before).norm()
 
 
 def test_weights_of_another_network_begin_no_run(tmp_path, scans):
