@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import hypothesis
 import pytest
 
+from relpose_ros import cli
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
@@ -20,6 +22,7 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 # Before torch is imported: more threads than cores make small tensors slower, not faster.
 os.environ.setdefault("OMP_NUM_THREADS", "2")
+os.environ.setdefault("GOMP_SPINCOUNT", cli.SPINS)
 
 # The same examples each time, and no deadline: how loaded a machine is must not decide whether a test passes.
 hypothesis.settings.register_profile("relpose_ros", deadline=None, derandomize=True, database=None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 
@@ -120,6 +121,32 @@ def test_ctrl_c_is_no_defect(monkeypatch):
 
     monkeypatch.setattr(cli, "_convert", interrupted)
     assert cli.main(["convert", "a", "--output", "b"]) == 130
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, cli.SPINS),
+        ({"GOMP_SPINCOUNT": "7"}, "7"),
+        ({"OMP_WAIT_POLICY": "active"}, None),
+    ],
+)
+def test_threads_wait_briefly_unless_the_user_says_otherwise(given, expected, tmp_path):
+    """Before PyTorch is imported, whose threads read it once."""
+    code = (
+        "import os, sys\n"
+        "from relpose_ros import cli\n"
+        "assert 'torch' not in sys.modules\n"
+        "cli.main(['convert', 'missing.pth', '--output', 'out'])\n"
+        "assert 'torch' in sys.modules\n"
+        "print(os.environ.get('GOMP_SPINCOUNT'))\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if k not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=True, env={**environment, **given}
+    )
+    assert done.stdout.strip() == str(expected)
 
 
 def test_the_commands_need_no_ros(tmp_path):
