@@ -17,6 +17,7 @@ import numpy as np
 
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import homogeneous
+from relpose_ros.inference.uncertainty import SURE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -57,13 +58,18 @@ class Refined:
     """(N, 3, 3) camera_from_object."""
     translations: FloatArray
     """(N, 3)."""
-    moved: tuple[int, ...]
-    """Cameras that took part."""
+    groups: tuple[tuple[int, ...], ...]
+    """Cameras that took part; of what ties one group to another the matches are not sure."""
     error_before: float
     """Median reprojection error, pixels."""
     error_after: float
     information: FloatArray
     """(6 M, 6 M) what the points tell of the M cameras that took part, see `information`."""
+
+    @property
+    def moved(self) -> tuple[int, ...]:
+        """Cameras that took part, in order."""
+        return tuple(sorted(camera for group in self.groups for camera in group))
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +130,9 @@ def refine(
     before, after = float(np.median(before_errors)), float(np.median(after_errors))
     if not after < before:
         return None
-    members = tuple(np.unique(chosen.camera).tolist())
-    return Refined(here[0], here[1], members, before, after, information(here, points, chosen))
+    members = np.unique(chosen.camera)
+    groups = _held_together(members, here[0], geometries)
+    return Refined(*here, groups, before, after, information(here, points, chosen))
 
 
 def information(poses: tuple[FloatArray, FloatArray], points: FloatArray, seen: _Observations) -> FloatArray:
@@ -209,10 +216,7 @@ def _connected(seen: _Observations, cameras: int) -> _Observations | None:
     while True:
         if len(seen.camera) == 0:
             return None
-        group = np.arange(cameras)
-        for point in range(int(seen.point.max()) + 1):
-            members = group[seen.camera[seen.point == point]]
-            group[np.isin(group, members)] = members.min()
+        group = _groups(seen.camera, cameras + seen.point, cameras + int(seen.point.max()) + 1)
         largest = np.bincount(group[seen.camera]).argmax()
         counts = np.bincount(seen.camera, minlength=cameras)
         keep = (group[seen.camera] == largest) & (counts[seen.camera] >= LEAST_OBSERVATIONS)
@@ -221,6 +225,29 @@ def _connected(seen: _Observations, cameras: int) -> _Observations | None:
         seen = seen.chosen(_repeated(seen, keep))
     points, members = int(seen.point.max()) + 1, np.unique(seen.camera)
     return seen if points >= LEAST_POINTS and len(members) >= 2 else None
+
+
+def _groups(ends: IntArray, others: IntArray, count: int) -> IntArray:
+    """Of each of some nodes the number of its group, those of nodes tied to each other. -> (count,)."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(len(ends)), (ends, others)), (count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
+def _held_together(
+    members: IntArray, rotations: FloatArray, geometries: Mapping[tuple[int, int], TwoViewGeometry]
+) -> tuple[tuple[int, ...], ...]:
+    """The members in groups that pairs tie whose matches are sure of the poses; most often one group."""
+    sure = [
+        (i, j)
+        for (i, j), geometry in geometries.items()
+        if i in members and j in members and geometry.chance_of(rotations[j] @ rotations[i].T) >= SURE
+    ]
+    ends = np.array(sure, np.int64).reshape(-1, 2)
+    group = _groups(ends[:, 0], ends[:, 1], len(rotations))[members]
+    return tuple(tuple(members[group == each].tolist()) for each in dict.fromkeys(group.tolist()))
 
 
 def _triangulate(poses: tuple[FloatArray, FloatArray], seen: _Observations) -> tuple[FloatArray, FloatArray]:

@@ -24,6 +24,7 @@ from relpose_ros.inference import epipolar
 from relpose_ros.inference.epipolar import Poses
 from relpose_ros.inference.local_features import find_features, match
 from relpose_ros.inference.rotation_evidence import Peak
+from relpose_ros.inference.uncertainty import BASIN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -112,6 +113,11 @@ class TwoViewGeometry:
         if self.probability < TRUSTED:
             return False
         return bool(so3.angle_between(rotation, self.poses[0].rotation) < AGREEMENT)
+
+    def chance_of(self, rotation: FloatArray) -> float:
+        """Probability of a pose with about this rotation, by the matches alone."""
+        near = [pose for pose in self.poses if so3.angle_between(rotation, pose.rotation) < BASIN]
+        return self.probability * sum(pose.weight for pose in near)
 
 
 NOTHING = TwoViewGeometry((), np.zeros((0, 2), np.int64), 0.0)
