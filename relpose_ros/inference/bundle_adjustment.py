@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     import numpy.typing as npt
+    from scipy.sparse import csr_matrix
 
     from relpose_ros.inference.local_features import LocalFeatures
     from relpose_ros.inference.matches import TwoViewGeometry
@@ -330,14 +331,18 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """Normal equations of M cameras and K points, in blocks."""
+    """Normal equations of M cameras and K points, in blocks, of which Q sightings tie a camera to a point."""
 
     cameras: FloatArray
     """(M, 6, 6)."""
     points: FloatArray
     """(K, 3, 3)."""
+    slot: IntArray
+    """(Q,) which of the cameras."""
+    point: IntArray
+    """(Q,)."""
     coupling: FloatArray
-    """(M, 6, K, 3)."""
+    """(Q, 6, 3)."""
     camera_slopes: FloatArray
     """(M, 6)."""
     point_slopes: FloatArray
@@ -345,8 +350,15 @@ class _Equations:
 
     def without_first(self) -> _Equations:
         """Of the other cameras."""
+        others = self.slot > 0
         return _Equations(
-            self.cameras[1:], self.points, self.coupling[1:], self.camera_slopes[1:], self.point_slopes
+            self.cameras[1:],
+            self.points,
+            self.slot[others] - 1,
+            self.point[others],
+            self.coupling[others],
+            self.camera_slopes[1:],
+            self.point_slopes,
         )
 
     def enlarge(self, damping: float) -> None:
@@ -361,10 +373,8 @@ class _Equations:
         Returns:
             (6 M, 6 M), and the slopes (6 M,).
         """
-        size = 6 * len(self.cameras)
-        coupling = self.coupling.reshape(size, -1)
-        eliminated = np.einsum("makb,kbc->makc", self.coupling, np.linalg.inv(self.points)).reshape(size, -1)
-        matrix = -eliminated @ coupling.T
+        eliminated = self._side_by_side(self.coupling @ np.linalg.inv(self.points)[self.point])
+        matrix = -eliminated @ self._side_by_side(self.coupling).T
         own = np.arange(len(self.cameras))
         matrix.reshape(len(own), 6, len(own), 6)[own, :, own] += self.cameras
         slopes = self.camera_slopes.reshape(-1) - eliminated @ self.point_slopes.reshape(-1)
@@ -374,9 +384,15 @@ class _Equations:
         """The steps of the cameras (M, 6) and of the points (K, 3)."""
         matrix, slopes = self.reduced()
         steps = -np.linalg.solve(matrix, slopes)
-        rest = self.point_slopes + (steps @ self.coupling.reshape(len(steps), -1)).reshape(-1, 3)
+        rest = self.point_slopes + (steps @ self._side_by_side(self.coupling)).reshape(-1, 3)
         shifts = -np.linalg.solve(self.points, rest[..., None])[..., 0]
         return np.asarray(steps.reshape(-1, 6)), np.asarray(shifts)
+
+    def _side_by_side(self, blocks: FloatArray) -> FloatArray:
+        """(Q, 6, 3) -> (6 M, 3 K)."""
+        whole = np.zeros((len(self.cameras), 6, len(self.points), 3))
+        whole[self.slot, :, self.point] = blocks  # a camera sees a point once
+        return whole.reshape(6 * len(self.cameras), -1)
 
 
 class _Problem:
@@ -387,6 +403,7 @@ class _Problem:
         self._seen, self._scale = seen, scale
         self.members, self._slot = np.unique(seen.camera, return_inverse=True)
         self._free = self.members[1:]
+        self._at_camera, self._at_point = _gathered(self._slot), _gathered(seen.point)
 
     def cost(self, state: _State) -> float:
         """Geman and McClure's robust loss of the reprojection errors, and the priors' squares, by half."""
@@ -400,21 +417,16 @@ class _Problem:
     def equations(self, state: _State) -> _Equations:
         """Of the sightings alone, weighted as the robust loss has it."""
         residuals, by_camera, by_point = self.weighted(state)
-        count, slot, point = len(state.points), self._slot, self._seen.point
-        across = by_camera.transpose(0, 2, 1)
-        equations = _Equations(
-            np.zeros((len(self.members), 6, 6)),
-            np.zeros((count, 3, 3)),
-            np.zeros((len(self.members), 6, count, 3)),
-            np.zeros((len(self.members), 6)),
-            np.zeros((count, 3)),
+        across_camera, across_point = by_camera.transpose(0, 2, 1), by_point.transpose(0, 2, 1)
+        return _Equations(
+            _summed(self._at_camera, across_camera @ by_camera),
+            _summed(self._at_point, across_point @ by_point),
+            self._slot,
+            self._seen.point,
+            across_camera @ by_point,
+            _summed(self._at_camera, (across_camera @ residuals[..., None])[..., 0]),
+            _summed(self._at_point, (across_point @ residuals[..., None])[..., 0]),
         )
-        np.add.at(equations.cameras, slot, across @ by_camera)
-        np.add.at(equations.camera_slopes, slot, (across @ residuals[..., None])[..., 0])
-        np.add.at(equations.points, point, by_point.transpose(0, 2, 1) @ by_point)
-        np.add.at(equations.point_slopes, point, (by_point.transpose(0, 2, 1) @ residuals[..., None])[..., 0])
-        equations.coupling[slot, :, point] = across @ by_point  # a camera sees a point once
-        return equations
 
     def stepped(self, state: _State, damping: float) -> _State:
         """After one step, the diagonal of the normal equations enlarged by the damping."""
@@ -464,3 +476,15 @@ class _Problem:
         depth = np.maximum(p[:, 2], 1e-3)
         unit = self._scale * self._seen.pixel[:, None]
         return (p[:, :2] / depth[:, None] - self._seen.rays) / unit, depth
+
+
+def _gathered(place: IntArray) -> csr_matrix:
+    """Sums what belongs to the same place, as a matrix. (Q,) of K places -> (K, Q)."""
+    from scipy.sparse import csr_matrix
+
+    return csr_matrix((np.ones(len(place)), (place, np.arange(len(place)))))
+
+
+def _summed(gathered: csr_matrix, blocks: FloatArray) -> FloatArray:
+    """(K, Q), (Q, ...) -> (K, ...)."""
+    return np.asarray(gathered @ blocks.reshape(len(blocks), -1)).reshape(-1, *blocks.shape[1:])
