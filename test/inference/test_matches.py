@@ -253,6 +253,14 @@ def test_only_trusted_matches_with_the_cameras_rotation_count():
     assert not replace(geometry, probability=0.4).agrees(np.eye(3))
 
 
+def test_the_chance_of_a_rotation_is_that_of_the_poses_about_it():
+    poses = tuple(pose(so3.exp([0, math.radians(at), 0]), w) for at, w in ((0, 0.5), (20, 0.3), (60, 0.2)))
+    geometry = TwoViewGeometry(poses, np.zeros((9, 2), np.int64), 0.9)
+    chances = [geometry.chance_of(so3.exp([0, math.radians(at), 0])) for at in (5, 65, 120)]
+    assert chances == pytest.approx([0.9 * 0.8, 0.9 * 0.2, 0.0])
+    assert NOTHING.chance_of(np.eye(3)) == 0
+
+
 # What is kept.
 
 
