@@ -1,6 +1,10 @@
 """Refines poses by the points that three or more views share: bundle adjustment with fixed intrinsics.
 
 It may only improve: `refine` answers with poses that reproject the same points better, or with None.
+
+The least squares are our own, since no solver of SciPy's knows that a point ties no other point: on scans of
+photographs the sparse steps of `least_squares` (LSMR) took four times as long and stopped short in some of
+the long valleys of narrow views; its dense steps took more than a hundred times as long.
 """
 
 from __future__ import annotations
@@ -13,11 +17,13 @@ import numpy as np
 
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import homogeneous
+from relpose_ros.inference.uncertainty import SURE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     import numpy.typing as npt
+    from scipy.sparse import csr_matrix
 
     from relpose_ros.inference.local_features import LocalFeatures
     from relpose_ros.inference.matches import TwoViewGeometry
@@ -38,6 +44,8 @@ are degrees off, then from good ones."""
 STEPS = 25
 LEAST_GAIN = 1e-4
 """Relative fall of the cost in a step below which it was the last."""
+LEAST_INFORMATION = 1e-12
+"""On the diagonal of the normal equations, which are then never singular."""
 TRANSLATION_DEVIATION = 0.5
 """How loosely translations are held to where they were, in the scan's unit: the scale comes from there."""
 ROTATION_DEVIATION = math.radians(20)
@@ -51,13 +59,18 @@ class Refined:
     """(N, 3, 3) camera_from_object."""
     translations: FloatArray
     """(N, 3)."""
-    moved: tuple[int, ...]
-    """Cameras that took part."""
+    groups: tuple[tuple[int, ...], ...]
+    """Cameras that took part; of what ties one group to another the matches are not sure."""
     error_before: float
     """Median reprojection error, pixels."""
     error_after: float
     information: FloatArray
     """(6 M, 6 M) what the points tell of the M cameras that took part, see `information`."""
+
+    @property
+    def moved(self) -> tuple[int, ...]:
+        """Cameras that took part, in order."""
+        return tuple(sorted(camera for group in self.groups for camera in group))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +131,9 @@ def refine(
     before, after = float(np.median(before_errors)), float(np.median(after_errors))
     if not after < before:
         return None
-    members = tuple(np.unique(chosen.camera).tolist())
-    return Refined(here[0], here[1], members, before, after, information(here, points, chosen))
+    members = np.unique(chosen.camera)
+    groups = _held_together(members, here[0], geometries)
+    return Refined(*here, groups, before, after, information(here, points, chosen))
 
 
 def information(poses: tuple[FloatArray, FloatArray], points: FloatArray, seen: _Observations) -> FloatArray:
@@ -132,35 +146,17 @@ def information(poses: tuple[FloatArray, FloatArray], points: FloatArray, seen: 
         (6 M, 6 M), for each of the M cameras that see something its turn (left perturbation of
         camera_from_object, rad) and its translation.
     """
-    rotations, translations = poses
-    members, slot = np.unique(seen.camera, return_inverse=True)
-    turned = np.einsum("qab,qb->qa", rotations[seen.camera], points[seen.point])
-    p = turned + translations[seen.camera]
-    by_p = np.zeros((len(p), 2, 3))
-    by_p[:, 0, 0] = by_p[:, 1, 1] = 1 / p[:, 2]
-    by_p[:, :, 2] = -p[:, :2] / p[:, 2:] ** 2
-    by_p /= seen.pixel[:, None, None]
-    error = (p[:, :2] / p[:, 2:] - seen.rays) / seen.pixel[:, None]
-    weight = 1 / (1 + (error**2).sum(1) / ROUNDS[-1][1] ** 2) ** 2
-    free = error.size - points.size - 6 * len(members) + 7
+    state, scale = _State(*poses, points), ROUNDS[-1][1]
+    problem = _Problem(seen, scale, poses)
+    errors = scale * problem.errors(state)
+    free = errors.size - points.size - 6 * len(problem.members) + 7
     # The median length of a Gaussian error in two dimensions is 1.18 deviations; what the points and poses
     # took up of it is given back. No feature is more exact than a third of a pixel.
-    deviation = float(np.median(np.linalg.norm(error, axis=1))) / 1.18 * math.sqrt(error.size / max(free, 1))
-    weight /= max(deviation, 1 / 3) ** 2
-    by_pose = np.concatenate([by_p @ -so3.hat(turned), by_p], 2)
-    by_point = by_p @ rotations[seen.camera]
-    own = np.zeros((len(members), 6, len(members), 6))
-    crossed = np.zeros((len(members), 6, len(points), 3))
-    of_points = np.zeros((len(points), 3, 3))
-    weighted = weight[:, None, None] * by_pose.transpose(0, 2, 1)
-    np.add.at(own.transpose(0, 2, 1, 3), (slot, slot), weighted @ by_pose)
-    np.add.at(crossed.transpose(0, 2, 1, 3), (slot, seen.point), weighted @ by_point)
-    np.add.at(of_points, seen.point, weight[:, None, None] * by_point.transpose(0, 2, 1) @ by_point)
-    # A point whose sightings all went astray holds nothing.
-    of_points += 1e-9 * np.eye(3)
-    left = np.einsum("mapb,pbc->mapc", crossed, np.linalg.inv(of_points)).reshape(6 * len(members), -1)
-    size = 6 * len(members)
-    return np.asarray(own.reshape(size, size) - left @ crossed.reshape(size, -1).T)
+    deviation = float(np.median(np.linalg.norm(errors, axis=1))) / 1.18
+    deviation *= math.sqrt(errors.size / max(free, 1))
+    equations = problem.equations(state)
+    equations.enlarge(0.0)
+    return equations.reduced()[0] * (scale / max(deviation, 1 / 3)) ** 2
 
 
 def _agreeing(
@@ -221,10 +217,7 @@ def _connected(seen: _Observations, cameras: int) -> _Observations | None:
     while True:
         if len(seen.camera) == 0:
             return None
-        group = np.arange(cameras)
-        for point in range(int(seen.point.max()) + 1):
-            members = group[seen.camera[seen.point == point]]
-            group[np.isin(group, members)] = members.min()
+        group = _groups(seen.camera, cameras + seen.point, cameras + int(seen.point.max()) + 1)
         largest = np.bincount(group[seen.camera]).argmax()
         counts = np.bincount(seen.camera, minlength=cameras)
         keep = (group[seen.camera] == largest) & (counts[seen.camera] >= LEAST_OBSERVATIONS)
@@ -233,6 +226,29 @@ def _connected(seen: _Observations, cameras: int) -> _Observations | None:
         seen = seen.chosen(_repeated(seen, keep))
     points, members = int(seen.point.max()) + 1, np.unique(seen.camera)
     return seen if points >= LEAST_POINTS and len(members) >= 2 else None
+
+
+def _groups(ends: IntArray, others: IntArray, count: int) -> IntArray:
+    """Of each of some nodes the number of its group, those of nodes tied to each other. -> (count,)."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(len(ends)), (ends, others)), (count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
+def _held_together(
+    members: IntArray, rotations: FloatArray, geometries: Mapping[tuple[int, int], TwoViewGeometry]
+) -> tuple[tuple[int, ...], ...]:
+    """The members in groups that pairs tie whose matches are sure of the poses; most often one group."""
+    sure = [
+        (i, j)
+        for (i, j), geometry in geometries.items()
+        if i in members and j in members and geometry.chance_of(rotations[j] @ rotations[i].T) >= SURE
+    ]
+    ends = np.array(sure, np.int64).reshape(-1, 2)
+    group = _groups(ends[:, 0], ends[:, 1], len(rotations))[members]
+    return tuple(tuple(members[group == each].tolist()) for each in dict.fromkeys(group.tolist()))
 
 
 def _triangulate(poses: tuple[FloatArray, FloatArray], seen: _Observations) -> tuple[FloatArray, FloatArray]:
@@ -283,8 +299,7 @@ def _adjust(
 ) -> tuple[FloatArray, FloatArray]:
     """Levenberg and Marquardt's least squares over the poses that take part, but the first, and all points.
 
-    Each step eliminates the points (Schur's complement), which solves it exactly: solvers that know nothing
-    of the blocks stop short in the long valleys of narrow views.
+    Each step eliminates the points (Schur's complement), which solves it exactly.
     """
     problem = _Problem(seen, scale, prior)
     here = _State(*poses, points)
@@ -314,25 +329,123 @@ class _State:
     """(K, 3) in the object frame."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Normal equations of M cameras and K points, in blocks, of which Q sightings tie a camera to a point."""
+
+    cameras: FloatArray
+    """(M, 6, 6)."""
+    points: FloatArray
+    """(K, 3, 3)."""
+    slot: IntArray
+    """(Q,) which of the cameras."""
+    point: IntArray
+    """(Q,)."""
+    coupling: FloatArray
+    """(Q, 6, 3)."""
+    camera_slopes: FloatArray
+    """(M, 6)."""
+    point_slopes: FloatArray
+    """(K, 3)."""
+
+    def without_first(self) -> _Equations:
+        """Of the other cameras."""
+        others = self.slot > 0
+        return _Equations(
+            self.cameras[1:],
+            self.points,
+            self.slot[others] - 1,
+            self.point[others],
+            self.coupling[others],
+            self.camera_slopes[1:],
+            self.point_slopes,
+        )
+
+    def enlarge(self, damping: float) -> None:
+        """The diagonal, by a share of it; a point whose sightings all went astray holds nothing."""
+        for blocks in (self.cameras, self.points):
+            diagonal = np.einsum("kaa->ka", blocks)
+            diagonal += damping * diagonal + LEAST_INFORMATION
+
+    def reduced(self) -> tuple[FloatArray, FloatArray]:
+        """The cameras' equations once the points are eliminated: Schur's complement.
+
+        Returns:
+            (6 M, 6 M), and the slopes (6 M,).
+        """
+        eliminated = self._side_by_side(self.coupling @ np.linalg.inv(self.points)[self.point])
+        matrix = -eliminated @ self._side_by_side(self.coupling).T
+        own = np.arange(len(self.cameras))
+        matrix.reshape(len(own), 6, len(own), 6)[own, :, own] += self.cameras
+        slopes = self.camera_slopes.reshape(-1) - eliminated @ self.point_slopes.reshape(-1)
+        return np.asarray(matrix), np.asarray(slopes)
+
+    def solved(self) -> tuple[FloatArray, FloatArray]:
+        """The steps of the cameras (M, 6) and of the points (K, 3)."""
+        matrix, slopes = self.reduced()
+        steps = -np.linalg.solve(matrix, slopes)
+        rest = self.point_slopes + (steps @ self._side_by_side(self.coupling)).reshape(-1, 3)
+        shifts = -np.linalg.solve(self.points, rest[..., None])[..., 0]
+        return np.asarray(steps.reshape(-1, 6)), np.asarray(shifts)
+
+    def _side_by_side(self, blocks: FloatArray) -> FloatArray:
+        """(Q, 6, 3) -> (6 M, 3 K)."""
+        whole = np.zeros((len(self.cameras), 6, len(self.points), 3))
+        whole[self.slot, :, self.point] = blocks  # a camera sees a point once
+        return whole.reshape(6 * len(self.cameras), -1)
+
+
 class _Problem:
     """What the sightings and the priors ask for."""
 
     def __init__(self, seen: _Observations, scale: float, prior: tuple[FloatArray, FloatArray]) -> None:
         self._prior = prior
         self._seen, self._scale = seen, scale
-        self.free = np.unique(seen.camera)[1:]
-        self._slot = np.full(len(prior[0]), -1)
-        self._slot[self.free] = np.arange(len(self.free))
+        self.members, self._slot = np.unique(seen.camera, return_inverse=True)
+        self._free = self.members[1:]
+        self._at_camera, self._at_point = _gathered(self._slot), _gathered(seen.point)
 
     def cost(self, state: _State) -> float:
         """Geman and McClure's robust loss of the reprojection errors, and the priors' squares, by half."""
-        square = (self._errors(self._in_camera(state)[1])[0] ** 2).sum(1)
+        square = (self.errors(state) ** 2).sum(1)
         return float((square / (1 + square)).sum() + (self.prior_residuals(state) ** 2).sum()) / 2
+
+    def errors(self, state: _State) -> FloatArray:
+        """Of the reprojections, in units of the robust scale. -> (Q, 2)."""
+        return self._errors_of(self._in_camera(state)[1])[0]
+
+    def equations(self, state: _State) -> _Equations:
+        """Of the sightings alone, weighted as the robust loss has it."""
+        residuals, by_camera, by_point = self.weighted(state)
+        across_camera, across_point = by_camera.transpose(0, 2, 1), by_point.transpose(0, 2, 1)
+        return _Equations(
+            _summed(self._at_camera, across_camera @ by_camera),
+            _summed(self._at_point, across_point @ by_point),
+            self._slot,
+            self._seen.point,
+            across_camera @ by_point,
+            _summed(self._at_camera, (across_camera @ residuals[..., None])[..., 0]),
+            _summed(self._at_point, (across_point @ residuals[..., None])[..., 0]),
+        )
+
+    def stepped(self, state: _State, damping: float) -> _State:
+        """After one step, the diagonal of the normal equations enlarged by the damping."""
+        equations = self.equations(state).without_first()
+        held = np.repeat([1 / ROTATION_DEVIATION, 1 / TRANSLATION_DEVIATION], 3)
+        equations.cameras[:] += np.diag(held**2)
+        equations.camera_slopes[:] += held * self.prior_residuals(state)
+        equations.enlarge(damping)
+        of_cameras, of_points = equations.solved()
+        turns, shifts = np.split(of_cameras, 2, 1)
+        rotations, translations = state.rotations.copy(), state.translations.copy()
+        rotations[self._free] = so3.exp(turns) @ rotations[self._free]
+        translations[self._free] += shifts
+        return _State(rotations, translations, state.points + of_points)
 
     def prior_residuals(self, state: _State) -> FloatArray:
         """Turns and shifts of the F free cameras from where they were. -> (F, 6)."""
-        turns = so3.log(state.rotations[self.free] @ self._prior[0][self.free].transpose(0, 2, 1))
-        shifts = state.translations[self.free] - self._prior[1][self.free]
+        turns = so3.log(state.rotations[self._free] @ self._prior[0][self._free].transpose(0, 2, 1))
+        shifts = state.translations[self._free] - self._prior[1][self._free]
         return np.concatenate([turns / ROTATION_DEVIATION, shifts / TRANSLATION_DEVIATION], 1)
 
     def weighted(self, state: _State) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -342,7 +455,7 @@ class _Problem:
             (Q, 2); (Q, 2, 6) by turn (left perturbation) and shift of the camera; (Q, 2, 3) by the point.
         """
         turned, p = self._in_camera(state)
-        error, depth = self._errors(p)
+        error, depth = self._errors_of(p)
         weight = 1 / (1 + (error**2).sum(1))
         by_p = np.zeros((len(depth), 2, 3))
         by_p[:, 0, 0] = by_p[:, 1, 1] = 1 / depth
@@ -351,51 +464,27 @@ class _Problem:
         by_camera = np.concatenate([by_p @ -so3.hat(turned), by_p], -1)
         return weight[:, None] * error, by_camera, by_p @ state.rotations[self._seen.camera]
 
-    def stepped(self, state: _State, damping: float) -> _State:
-        """After one step, the diagonal of the normal equations enlarged by the damping."""
-        residuals, by_camera, by_point = self.weighted(state)
-        count, cameras = len(state.points), len(self.free)
-        slot, point = self._slot[self._seen.camera], self._seen.point
-        moving = slot >= 0
-        held = np.repeat([1 / ROTATION_DEVIATION, 1 / TRANSLATION_DEVIATION], 3)
-        of_cameras = np.tile(np.diag(held**2), (cameras, 1, 1))
-        camera_slopes = held * self.prior_residuals(state)
-        of_points, point_slopes = np.zeros((count, 3, 3)), np.zeros((count, 3))
-        coupling = np.zeros((cameras, 6, count, 3))
-        across = by_camera[moving].transpose(0, 2, 1)
-        np.add.at(of_cameras, slot[moving], across @ by_camera[moving])
-        np.add.at(camera_slopes, slot[moving], (across @ residuals[moving][..., None])[..., 0])
-        np.add.at(of_points, point, by_point.transpose(0, 2, 1) @ by_point)
-        np.add.at(point_slopes, point, (by_point.transpose(0, 2, 1) @ residuals[..., None])[..., 0])
-        coupling[slot[moving], :, point[moving]] = across @ by_point[moving]
-        for blocks in (of_cameras, of_points):
-            diagonal = np.einsum("kaa->ka", blocks)
-            diagonal += damping * diagonal + 1e-12
-        inverse = np.linalg.inv(of_points)
-        eliminated = np.einsum("cakb,kbd->cakd", coupling, inverse).reshape(6 * cameras, 3 * count)
-        flat = coupling.reshape(6 * cameras, 3 * count)
-        reduced = -eliminated @ flat.T
-        for camera in range(cameras):
-            block = slice(6 * camera, 6 * camera + 6)
-            reduced[block, block] += of_cameras[camera]
-        target = eliminated @ point_slopes.reshape(-1) - camera_slopes.reshape(-1)
-        steps = np.linalg.solve(reduced, target)
-        rest = point_slopes + (steps @ flat).reshape(-1, 3)
-        turns, shifts = np.split(steps.reshape(-1, 6), 2, 1)
-        rotations, translations = state.rotations.copy(), state.translations.copy()
-        rotations[self.free] = so3.exp(turns) @ rotations[self.free]
-        translations[self.free] += shifts
-        return _State(rotations, translations, state.points - np.einsum("kab,kb->ka", inverse, rest))
-
     def _in_camera(self, state: _State) -> tuple[FloatArray, FloatArray]:
         """Each sighting's point, turned into the axes of its camera, and in its frame. -> (Q, 3) twice."""
         camera = self._seen.camera
         turned = np.einsum("qab,qb->qa", state.rotations[camera], state.points[self._seen.point])
         return turned, turned + state.translations[camera]
 
-    def _errors(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _errors_of(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Errors in units of the robust scale (Q, 2), and the depths (Q,)."""
         # A point behind its camera has a large error there, and a way back.
         depth = np.maximum(p[:, 2], 1e-3)
         unit = self._scale * self._seen.pixel[:, None]
         return (p[:, :2] / depth[:, None] - self._seen.rays) / unit, depth
+
+
+def _gathered(place: IntArray) -> csr_matrix:
+    """Sums what belongs to the same place, as a matrix. (Q,) of K places -> (K, Q)."""
+    from scipy.sparse import csr_matrix
+
+    return csr_matrix((np.ones(len(place)), (place, np.arange(len(place)))))
+
+
+def _summed(gathered: csr_matrix, blocks: FloatArray) -> FloatArray:
+    """(K, Q), (Q, ...) -> (K, ...)."""
+    return np.asarray(gathered @ blocks.reshape(len(blocks), -1)).reshape(-1, *blocks.shape[1:])

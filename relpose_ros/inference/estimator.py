@@ -17,7 +17,7 @@ from relpose_ros.estimates import CameraPose, ScanEstimate, Verdict
 from relpose_ros.geometry import cameras, so3_grid
 from relpose_ros.inference import bundle_adjustment
 from relpose_ros.inference.calibration import Calibration
-from relpose_ros.inference.camera_positions import apart, baseline, joined, place, rows_of
+from relpose_ros.inference.camera_positions import apart, baseline, joined, place
 from relpose_ros.inference.evidence import SHIPPED, EvidenceSettings
 from relpose_ros.inference.global_rotations import joint_scores, solve
 from relpose_ros.inference.matches import Matcher, peaks
@@ -326,13 +326,11 @@ class Estimator:
         refined = self._refine(scan, found, rotations, placed)
         if refined is None:
             return rotations, placed, placed_joint
-        settled, settled_joint = settle(refined, placed_joint)
+        # The directions between cameras that moved are told by the points, and better.
+        settled, settled_joint = settle(refined, joint)
         others = [camera for camera in range(len(rotations)) if camera not in refined.moved]
-        # The directions between cameras that moved are told already, and better.
         left = [each for each in baselines if each.i in others or each.j in others]
         settled[others] = centres[others]
-        rows = rows_of(others)
-        settled_joint[np.ix_(rows, rows)] = joint[np.ix_(rows, rows)]
         return refined.rotations, *place(settled, settled_joint, left)
 
     def _refine(

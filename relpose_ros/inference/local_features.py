@@ -26,10 +26,15 @@ if TYPE_CHECKING:
     Descriptors = npt.NDArray[np.float32]
 
 MOST_FEATURES = 2500
-LONGEST_SIDE = 800
-"""Pixels: a larger part of an image is shrunk to it. Features of one more octave cost more than they add."""
-LARGEST_SCALE = 2.0
-"""A smaller part is enlarged, up to twice: SIFT finds little in a small crop as it is."""
+"""The strongest; with fewer, views far apart do not match."""
+MOST_SQUEEZED = 1200
+"""Of the squeezed picture: more match hardly more, and matching costs the most."""
+LEAST_SHARE = 0.1
+"""Of a picture that a mask is taken to fill: SIFT's time grows as that falls."""
+LONGEST_SIDE = 640
+"""Pixels: a larger part of an image is shrunk to it. Finer features add time and hardly any matches."""
+LARGEST_SCALE = 1.5
+"""A smaller part is enlarged, up to this: SIFT finds little in a small crop as it is."""
 CONTRAST = 0.01
 """A quarter of Lowe's: plain objects have few features of any contrast, and a bad one costs little."""
 RATIO = 0.85
@@ -85,7 +90,7 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
         region = None if region is None else cv2.resize(region, size, interpolation=cv2.INTER_NEAREST)
     narrow, narrow_region = _squeezed(grey, region)
-    found = [_detect(grey, region), _detect(narrow, narrow_region)]
+    found = [_detect(grey, region, MOST_FEATURES), _detect(narrow, narrow_region, MOST_SQUEEZED)]
     found[1][0][:, 0] *= grey.shape[1] / narrow.shape[1]
     points, orientations, descriptors = (np.concatenate(parts) for parts in zip(*found, strict=True))
     plain = len(found[0][0])
@@ -131,9 +136,8 @@ def _nearest(first: Descriptors, second: Descriptors) -> IntArray:
     highest = likeness[rows, best]
     likeness[rows, best] = -1
     chosen = rows[_apart(highest, likeness.max(1))]
-    likeness[rows, best] = highest
-    # The other way round for the few that are left alone: maxima down all columns are slow.
-    columns = likeness[:, best[chosen]].T
+    # The other way round for the few that are left alone, and worked out anew: columns are slow to read.
+    columns = second[best[chosen]] @ first.T
     mutual = columns.argmax(1) == chosen
     columns[np.arange(len(chosen)), chosen] = -1
     chosen = chosen[mutual & _apart(highest[chosen], columns.max(1))]
@@ -145,14 +149,18 @@ def _apart(best: Descriptors, second: Descriptors) -> npt.NDArray[np.bool_]:
     return np.asarray(2 - 2 * best + ROUNDING < RATIO**2 * (2 - 2 * second))
 
 
-def _detect(grey: Any, region: Any) -> tuple[FloatArray, FloatArray, Descriptors]:
+def _detect(grey: Any, region: Any, most: int) -> tuple[FloatArray, FloatArray, Descriptors]:
     """Points (K, 2) from the corner of the first pixel, orientations and descriptors."""
     import cv2
 
+    # SIFT counts the features outside the region too, before it drops them.
+    share = 1.0 if region is None else max(float(region.mean()), LEAST_SHARE)
     create: Any = vars(cv2)["SIFT_create"]  # in every version, and in no version's type stubs
-    sift = create(nfeatures=MOST_FEATURES, contrastThreshold=CONTRAST)
+    sift = create(nfeatures=round(most / share), contrastThreshold=CONTRAST)
     points, found = sift.detectAndCompute(grey, region)
     descriptors = np.zeros((0, 128), np.float32) if found is None else found
+    strongest = np.argsort([-point.response for point in points], kind="stable")[:most]
+    points, descriptors = [points[k] for k in strongest], descriptors[strongest]
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
     # OpenCV's (0, 0) is the first pixel's centre.
     places = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5

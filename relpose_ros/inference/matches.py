@@ -24,6 +24,7 @@ from relpose_ros.inference import epipolar
 from relpose_ros.inference.epipolar import Poses
 from relpose_ros.inference.local_features import find_features, match
 from relpose_ros.inference.rotation_evidence import Peak
+from relpose_ros.inference.uncertainty import BASIN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,15 +41,21 @@ THRESHOLD = 1.5
 """Of an inlier, in pixels of the picture in which the features were found."""
 REACH = 4.0
 """Pixels: matches that may obey a rival of the pose that was found, if not that one."""
-LEAST_MATCHES = 8
+LEAST_MATCHES = 16
+"""Fewer are not trusted (see `trust`), whatever they say."""
+TURN = math.radians(30)
+"""How far features may turn from one picture to the other beside the way that most turn, rad: a surface at
+a slant of 60 degrees turns gradients by up to 20, those of accidental matches turn anyhow."""
+ITERATIONS = 1000
+"""Of the robust estimator at most."""
 GUESSED_FOCAL_DEVIATION = 0.2
 """Relative standard deviation of a guessed focal length. A rotation seen through a wrong one is wrong in
 proportion."""
 PLANAR_SHARE = 0.8
 """Of the matches, explained by one homography: from here on the points may lie on a plane, which two poses
 explain equally well, or the camera may only have turned."""
-TRUST = (-11.19, 1.91, 5.98)
-"""Coefficients of `trust`: of the logarithm of the inliers, and of their coherence."""
+TRUST = (-6.24, 2.2)
+"""Coefficients of `trust`: the bias, and that of the inliers' logarithm."""
 LARGEST_TRUST = 0.995
 """No captures are enough to learn how rare the rarest mistakes are."""
 WIDENING = 8.0
@@ -90,22 +97,6 @@ class RelativePose:
     """Relative to the pair's other explanations; they sum to one, less what is not worth telling."""
 
 
-@dataclass(frozen=True)
-class Support:
-    """What tells right explanations of matches from wrong ones."""
-
-    inliers: int
-    """Matches that the best explanation explains."""
-    coherence: float
-    """0 to 1: length of the mean direction by which the inliers' features turn from one picture to the other.
-    Those of one object turn nearly alike, those of accidental matches anyhow."""
-
-    @property
-    def predictors(self) -> tuple[float, float]:
-        """What `trust` is a logistic function of."""
-        return math.log(self.inliers), self.coherence
-
-
 @dataclass(frozen=True, eq=False)
 class TwoViewGeometry:
     """What the matches of two views say. No poses, no opinion."""
@@ -123,6 +114,11 @@ class TwoViewGeometry:
             return False
         return bool(so3.angle_between(rotation, self.poses[0].rotation) < AGREEMENT)
 
+    def chance_of(self, rotation: FloatArray) -> float:
+        """Probability of a pose with about this rotation, by the matches alone."""
+        near = [pose for pose in self.poses if so3.angle_between(rotation, pose.rotation) < BASIN]
+        return self.probability * sum(pose.weight for pose in near)
+
 
 NOTHING = TwoViewGeometry((), np.zeros((0, 2), np.int64), 0.0)
 
@@ -132,18 +128,20 @@ def relate(first: LocalFeatures, second: LocalFeatures) -> TwoViewGeometry:
     explained = explain(first, second)
     if explained is None:
         return NOTHING
-    poses, inliers, support = explained
-    return TwoViewGeometry(poses, inliers, trust(support))
+    poses, inliers = explained
+    return TwoViewGeometry(poses, inliers, trust(len(inliers)))
 
 
-def explain(
-    first: LocalFeatures, second: LocalFeatures
-) -> tuple[tuple[RelativePose, ...], IntArray, Support] | None:
-    """The poses that explain the matches of two views, best first, the inliers (M, 2) and the best's support.
+def explain(first: LocalFeatures, second: LocalFeatures) -> tuple[tuple[RelativePose, ...], IntArray] | None:
+    """The poses that explain the matches of two views, best first, and the best's inliers (M, 2).
 
     None where there are too few matches, or too few that any pose explains.
     """
     matches = match(first, second)
+    if len(matches) < LEAST_MATCHES:
+        return None
+    # Of one object seen twice they do (weak geometric consistency: Jegou et al. 2008).
+    matches = matches[_alike(second.orientations[matches[:, 1]] - first.orientations[matches[:, 0]])]
     if len(matches) < LEAST_MATCHES:
         return None
     rays_i, rays_j = homogeneous(first.rays[matches[:, 0]]), homogeneous(second.rays[matches[:, 1]])
@@ -163,21 +161,27 @@ def explain(
     if inside.sum() < LEAST_MATCHES:
         return None
     inliers = matches[inside]
-    turns = second.orientations[inliers[:, 1]] - first.orientations[inliers[:, 0]]
-    support = Support(len(inliers), float(np.abs(np.exp(1j * turns).mean())))
     stated = _with_covariances(poses, weights, near_i, near_j, pixel)
     if first.guessed or second.guessed:
         stated = tuple(_widened(pose) for pose in stated)
-    return stated, np.stack([first.places[inliers[:, 0]], second.places[inliers[:, 1]]], 1), support
+    return stated, np.stack([first.places[inliers[:, 0]], second.places[inliers[:, 1]]], 1)
 
 
-def trust(support: Support) -> float:
+def trust(inliers: int) -> float:
     """Probability that one of a pair's poses is right, learned from pairs whose pose is known.
 
-    Logistic in the logarithm of the inliers and in their coherence (`benchmarks/match_trust.py` fits it).
+    Logistic in the logarithm of the inliers (`benchmarks/match_trust.py` fits it).
     """
-    score = TRUST[0] + float(np.dot(TRUST[1:], support.predictors))
-    return LARGEST_TRUST / (1 + math.exp(-score))
+    return LARGEST_TRUST / (1 + math.exp(-(TRUST[0] + TRUST[1] * math.log(inliers))))
+
+
+def _alike(turns: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which of some angles are among the most that lie within `TURN` of one. (M,) rad -> (M,)."""
+    angles = turns % math.tau
+    around = np.sort(angles)
+    last = np.searchsorted(np.concatenate([around, around + math.tau]), around + 2 * TURN, side="right")
+    first = around[(last - np.arange(len(around))).argmax()]
+    return np.asarray((angles - first) % math.tau <= 2 * TURN)
 
 
 def _five_points(rays_i: FloatArray, rays_j: FloatArray, pixel: float) -> Poses | None:
@@ -189,7 +193,7 @@ def _five_points(rays_i: FloatArray, rays_j: FloatArray, pixel: float) -> Poses 
     settings.loMethod = cv2.LOCAL_OPTIM_SIGMA
     settings.final_polisher = cv2.MAGSAC
     settings.loIterations, settings.loSampleSize, settings.final_polisher_iterations = 10, 20, 5
-    settings.maxIterations, settings.confidence, settings.threshold = 2000, 0.9999, THRESHOLD
+    settings.maxIterations, settings.confidence, settings.threshold = ITERATIONS, 0.999, THRESHOLD
     settings.randomGeneratorState = 1  # the same answer each time
     # In pixels of the picture: thresholds in other units have been misread by some versions.
     points_i, points_j = rays_i[:, :2] / pixel, rays_j[:, :2] / pixel

@@ -15,11 +15,14 @@ from relpose_ros.inference.camera_positions import rows_of
 from relpose_ros.inference.matches import FLOOR, WIDENING
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy.typing as npt
 
     from relpose_ros.inference.bundle_adjustment import Refined
 
     FloatArray = npt.NDArray[np.float64]
+    IntArray = npt.NDArray[np.int64]
 
 AXES_APART = 0.2
 """How far from the others' common point the axes of cameras may pass that nobody could refine, in the unit of
@@ -32,8 +35,9 @@ def settle(refined: Refined, joint: FloatArray) -> tuple[FloatArray, FloatArray]
     """Centres and joint covariance after a bundle adjustment, in the frame of the estimate.
 
     What the points tell joins what was known before, widened as a pair's matches are: errors of features near
-    each other go together, and of the intrinsics nothing is averaged away. Cameras that took no part stay
-    where they were; their errors no longer go with those of the others.
+    each other go together, and of the intrinsics nothing is averaged away. Of groups that no sure matches tie
+    the points tell each for itself, since the points come from the matches and would share their mistake.
+    Cameras that took no part stay where they were; their errors no longer go with those of the others.
 
     Args:
         refined: The adjustment's poses and what its points tell.
@@ -50,12 +54,16 @@ def settle(refined: Refined, joint: FloatArray) -> tuple[FloatArray, FloatArray]
         turns[slot, :, slot] = _by_adjustment(rotations[camera], refined.translations[camera])
     turn = turns.reshape(len(rows), len(rows))
     told = turn.T @ refined.information @ turn / WIDENING
-    # The points leave it to what was known before where their cameras stand as a whole. The first camera sets
-    # the frame; of the others, which erred together, all know as much of that as one.
-    share = np.array([1.0 if camera == 0 else 1 / np.sqrt(len(moved) - (0 in moved)) for camera in moved])
-    share = np.repeat(share, 6)
+    share = np.ones(len(rows))
+    groups = [np.searchsorted(moved, group).tolist() for group in refined.groups]
+    for group in groups:
+        # The points leave it to what was known before where their cameras stand as a whole. The first camera
+        # sets the frame; of the others, which erred together, all know as much of that as one.
+        others = [slot for slot in group if moved[slot] != 0]
+        share[rows_of(others)] = 1 / np.sqrt(max(len(others), 1))
+    told = _each_for_itself(told, [rows_of(group) for group in groups])
     before = share[:, None] * np.linalg.inv(joint[np.ix_(rows, rows)]) * share
-    spread = np.linalg.inv(before + told)
+    spread = np.asarray(np.linalg.inv(before + told))
     if 0 in moved:
         silent = 1 - len(moved) / len(rotations)
         centres[moved], spread = _about_the_axes(rotations[moved], centres[moved], spread, silent)
@@ -69,6 +77,17 @@ def settle(refined: Refined, joint: FloatArray) -> tuple[FloatArray, FloatArray]
     settled[:, rows] = 0
     settled[np.ix_(rows, rows)] = (spread + spread.T) / 2
     return centres, settled
+
+
+def _each_for_itself(information: FloatArray, groups: Sequence[IntArray]) -> FloatArray:
+    """An information matrix without what it says of how some groups of rows go together."""
+    apart = np.zeros_like(information)
+    for own in groups:
+        others = np.setdiff1d(np.arange(len(information)), own)
+        across = information[np.ix_(own, others)]
+        spread = np.linalg.pinv(information[np.ix_(others, others)], rcond=1e-10, hermitian=True)
+        apart[np.ix_(own, own)] = information[np.ix_(own, own)] - across @ spread @ across.T
+    return apart
 
 
 def _by_adjustment(camera_from_object: FloatArray, translation: FloatArray) -> FloatArray:

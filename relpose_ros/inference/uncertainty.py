@@ -43,6 +43,8 @@ FLOOR = math.radians(0.1)
 UNIFORM_VARIANCE = (math.pi**2 / 3 + 2) / 3
 """Of each component of a rotation vector whose rotation may be any, rad^2: angles a have density
 (1 - cos a) / pi."""
+UNTIED = 1e-6
+"""Information, rad^-2, of a camera that no pair tells anything of: as good as none."""
 
 
 def describe_pairs(
@@ -318,20 +320,32 @@ def _joint_spread(
     With R_ij = R_j R_i^T, turns e_i and e_j of the cameras turn R_ij by e_j - R_ij e_i. Every view takes part
     in N - 1 pairs, whose errors are therefore not N - 1 independent ones: the sum of the pairs' information
     is divided by N / 2, which is exact where each view has one error of its own.
+
+    A pair that may have any rotation has a covariance too, that of the uniform distribution. That much is
+    taken off what each pair tells, and given back to each camera once, as the mean of its pairs: however many
+    say nothing, together they say no more.
     """
     relative = solution[energies.j] @ solution[energies.i].mT
     masses = distributions.masses(calibration.temperature, calibration.flat)
-    information = np.zeros((3 * energies.views, 3 * energies.views))
+    information = UNTIED * np.eye(3 * energies.views)
+    given_back = np.zeros((energies.views, 3, 3))
     for pair, (i, j) in enumerate(zip(energies.i.tolist(), energies.j.tolist(), strict=True)):
         moment = _second_moment(
             distributions, pair, relative[pair], _about(distributions, energies, pair, relative, masses)
         )
+        variances, axes = np.linalg.eigh(moment)
+        nothing = axes / np.maximum(variances, UNIFORM_VARIANCE) @ axes.T
+        told = axes / variances @ axes.T - nothing
+        turned = relative[pair].numpy()
+        given_back[i] += turned.T @ nothing @ turned / (energies.views - 1)
+        given_back[j] += nothing / (energies.views - 1)
         jacobian = np.zeros((3, 3 * energies.views))
-        jacobian[:, 3 * i : 3 * i + 3] = -relative[pair].numpy()
+        jacobian[:, 3 * i : 3 * i + 3] = -turned
         jacobian[:, 3 * j : 3 * j + 3] = np.eye(3)
-        information += jacobian.T @ np.linalg.inv(moment) @ jacobian
+        information += jacobian.T @ told @ jacobian
     joint = np.linalg.inv(information[3:, 3:] / (energies.views / 2)) * calibration.rotation_spread
     spread = np.zeros((energies.views, 3, 3))
     for camera in range(1, energies.views):
-        spread[camera] = joint[3 * camera - 3 : 3 * camera, 3 * camera - 3 : 3 * camera]
+        own = joint[3 * camera - 3 : 3 * camera, 3 * camera - 3 : 3 * camera]
+        spread[camera] = np.linalg.inv(np.linalg.inv(own) + given_back[camera])
     return spread

@@ -9,7 +9,7 @@ from relpose_ros.captures.folder import Frame, load_capture, save_capture
 from relpose_ros.evaluation.match_trust import RIGHT, MatchedPairs, fit_trust, observe
 from relpose_ros.geometry import so3
 from relpose_ros.inference.local_features import find_features
-from relpose_ros.inference.matches import Support, relate, trust
+from relpose_ros.inference.matches import relate, trust
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
 FOCAL, SIDE = 300.0, 160
@@ -61,15 +61,15 @@ def capture(textures, tmp_path_factory):
 
 def test_observes_the_pairs_whose_cameras_are_known(capture):
     pairs = observe(load_capture(capture.folder), masked=True)
-    assert pairs.predictors.shape == (3, 2)  # nothing matches the plain one
+    assert pairs.inliers.shape == (3,)  # nothing matches the plain one
     assert pairs.right.tolist() == [True, True, True]
     assert pairs.errors.shape == (3, 3)
     assert pairs.covariances.shape == (3, 3, 3)
     assert np.linalg.norm(pairs.errors, axis=1).max() < RIGHT
     found = relate(*(find_features(capture.view(k)) for k in (0, 1)))
-    assert math.exp(pairs.predictors[0, 0]) == pytest.approx(len(found.inliers))
-    # By the same predictors the matches say how far to trust themselves.
-    assert found.probability == trust(Support(len(found.inliers), pairs.predictors[0, 1]))
+    assert pairs.inliers[0] == len(found.inliers)
+    # By the same number the matches say how far to trust themselves.
+    assert found.probability == trust(len(found.inliers))
 
 
 def test_a_wrong_pose_on_file_counts_as_wrong(capture, textures, tmp_path):
@@ -82,28 +82,29 @@ def test_a_wrong_pose_on_file_counts_as_wrong(capture, textures, tmp_path):
     assert pairs.covariances.shape == (0, 3, 3)
 
 
+def stated(coefficients, inliers):
+    return 1 / (1 + np.exp(-(coefficients[0] + coefficients[1] * np.log(inliers))))
+
+
 def test_the_regression_finds_the_coefficients_of_its_own_kind():
     generator = np.random.default_rng(0)
-    coefficients = np.array([-8.0, 2.0, 3.0])
-    predictors = np.stack([generator.uniform(2, 6, 8000), generator.uniform(0, 1, 8000)], 1)
-    chance = 1 / (1 + np.exp(-(coefficients[0] + predictors @ coefficients[1:])))
-    right = generator.uniform(size=8000) < chance
+    coefficients = np.array([-8.0, 2.0])
+    inliers = np.exp(generator.uniform(2, 6, 8000))
+    right = generator.uniform(size=8000) < stated(coefficients, inliers)
     none = np.zeros((0, 3))
-    found = fit_trust(MatchedPairs(predictors, right, none, none[..., None]))
-    np.testing.assert_allclose(found, coefficients, rtol=0.15, atol=0.1)
+    found = fit_trust(MatchedPairs(inliers, right, none, none[..., None]))
+    np.testing.assert_allclose(found, coefficients, rtol=0.1, atol=0.1)
     # The likelihood's slope vanishes: as many are right as were said to be.
-    stated = 1 / (1 + np.exp(-(found[0] + predictors @ found[1:])))
-    assert stated.mean() == pytest.approx(right.mean(), abs=1e-6)
+    assert stated(found, inliers).mean() == pytest.approx(right.mean(), abs=1e-6)
 
 
 def test_few_pairs_make_nothing_certain():
     """Perfectly separable: without the ridge the coefficients would have no end."""
-    predictors = np.array([[2.0, 0.3], [2.2, 0.3], [4.0, 0.9], [4.4, 0.9]])
+    inliers = np.array([10.0, 12.0, 60.0, 80.0])
     right = np.array([False, False, True, True])
     none = np.zeros((0, 3))
-    found = fit_trust(MatchedPairs(predictors, right, none, none[..., None]))
-    stated = 1 / (1 + np.exp(-(found[0] + predictors @ found[1:])))
+    found = fit_trust(MatchedPairs(inliers, right, none, none[..., None]))
     assert np.isfinite(found).all()
-    assert (stated[right] > 0.8).all()
-    assert (stated[~right] < 0.2).all()
-    assert np.abs(stated - right).max() > 0.003
+    assert (stated(found, inliers)[right] > 0.8).all()
+    assert (stated(found, inliers)[~right] < 0.2).all()
+    assert np.abs(stated(found, inliers) - right).max() > 0.003

@@ -236,11 +236,8 @@ def test_derivatives_are_those_of_the_cost(problem):
     """The priors' turns are taken as small: without priors, exactly."""
     problem, state = problem
     problem._prior = state.rotations, state.translations
-    residuals, by_camera, by_point = problem.weighted(state)
-    slope = np.zeros((3, 6)), np.zeros((8, 3))
-    np.add.at(slope[0], problem._seen.camera, np.einsum("qak,qa->qk", by_camera, residuals))
-    np.add.at(slope[1], problem._seen.point, np.einsum("qak,qa->qk", by_point, residuals))
-    found = np.concatenate([slope[0][1:].reshape(-1), slope[1].reshape(-1)])
+    equations = problem.equations(state)
+    found = np.concatenate([equations.camera_slopes[1:].reshape(-1), equations.point_slopes.reshape(-1)])
     for column, step in enumerate(1e-6 * np.eye(36)):
         ahead, behind = (problem.cost(moved(state, way)) for way in (step, -step))
         assert found[column] == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-3)

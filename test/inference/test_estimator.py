@@ -339,7 +339,7 @@ def test_a_refinement_that_contradicts_the_pairs_is_not_taken(network, ball, of_
     def bent(rotations, translations, *rest):
         calls.append(rotations)
         turned = np.concatenate([rotations[:1], so3.exp([0, 0.4, 0]) @ rotations[1:]])
-        return Refined(turned, translations, (0, 1, 2), 5.0, 0.1, np.eye(18))
+        return Refined(turned, translations, ((0, 1, 2),), 5.0, 0.1, np.eye(18))
 
     monkeypatch.setattr(bundle_adjustment, "refine", bent)
     refused = estimated(network, ball, use="refine")

@@ -6,7 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from relpose_ros.inference.local_features import LocalFeatures, find_features, match
+from relpose_ros.inference import local_features
+from relpose_ros.inference.local_features import (
+    LARGEST_SCALE,
+    LONGEST_SIDE,
+    LocalFeatures,
+    find_features,
+    match,
+)
 from relpose_ros.inference.matches import NOTHING, relate
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
@@ -78,12 +85,12 @@ def test_features_lie_where_the_picture_has_them(textured):
     view = textured(2, 612, 1187, intrinsics=Intrinsics(900, 910, 590, 310))
     shrunk = find_features(view)
     assert not shrunk.guessed
-    assert shrunk.pixel == pytest.approx(1187 / 800 / 905)
+    assert shrunk.pixel == pytest.approx(1187 / LONGEST_SIDE / 905)
     np.testing.assert_allclose(np.linalg.norm(shrunk.descriptors, axis=1), 1, atol=1e-5)
     shifts = []
     for top in (0, 452):
         part = find_features(replace(view, box=BoundingBox(100, top, 500, top + 160)))
-        assert part.pixel == pytest.approx(1 / 2 / 905)
+        assert part.pixel == pytest.approx(1 / LARGEST_SCALE / 905)
         together = match(shrunk, part)
         assert len(together) > 50
         apart = (shrunk.rays[together[:, 0]] - part.rays[together[:, 1]]) * [900, 910]
@@ -103,8 +110,8 @@ def test_a_mirrored_picture_has_mirrored_features(textured):
     near = apart.min(1) < 1.5
     assert near.sum() > 100
     error = np.median((places - others[apart.argmin(1)])[near], axis=0) / 2
-    # The picture was enlarged by two, so that SIFT's own bias is an eighth of a pixel.
-    assert -0.03 < error[0] < 0.16
+    # SIFT's own bias is a quarter of a pixel of the picture it was given.
+    assert -0.06 < error[0] * LARGEST_SCALE < 0.32
 
 
 def test_features_are_those_of_the_box(textured):
@@ -129,6 +136,23 @@ def test_features_are_those_of_the_mask(textured):
     assert len(find_features(view, surroundings=True).rays) > len(inside)
 
 
+def test_what_lies_outside_the_mask_takes_no_place_of_the_objects_features(textured, monkeypatch):
+    monkeypatch.setattr(local_features, "MOST_FEATURES", 40)
+    mask = np.zeros((160, 200), bool)
+    mask[40:120, 50:130] = True
+    masked, whole = (find_features(textured(0, mask=each)) for each in (mask, None))
+    assert masked.plain == whole.plain == 40
+
+
+def test_the_strongest_features_are_kept(textured, monkeypatch):
+    view = textured(0, mask=np.ones((160, 200), bool))
+    every = find_features(view)
+    monkeypatch.setattr(local_features, "MOST_FEATURES", every.plain // 2)
+    some = find_features(view)
+    assert some.plain == every.plain // 2
+    np.testing.assert_array_equal(some.rays[: some.plain], every.rays[: some.plain])
+
+
 def test_a_crop_says_what_the_whole_picture_says(textured):
     whole = textured(1, box=BoundingBox(60, 40, 160, 130), mask=np.ones((160, 200), bool))
     crop = replace(whole, image=whole.image[30:140, 50:170], mask=whole.mask[30:140, 50:170], origin=(50, 30))
@@ -143,7 +167,7 @@ def test_without_intrinsics_the_focal_length_is_guessed(textured):
     view = textured(0)
     features = find_features(view)
     assert features.guessed
-    assert features.pixel == pytest.approx(1 / (2 * 1.2 * 200))
+    assert features.pixel == pytest.approx(1 / (LARGEST_SCALE * 1.2 * 200))
     known = find_features(replace(view, intrinsics=Intrinsics(240, 240, 100, 80)))
     assert not known.guessed
     np.testing.assert_allclose(known.rays, features.rays)

@@ -16,14 +16,14 @@ ANGLES = [0.0, 20.0, 40.0, 60.0]
 BEFORE = np.diag([0.1**2] * 3 + [math.radians(5) ** 2] * 3)
 
 
-def adjusted(scene, silent=(), noise=0.5, degrees=1.0, shift=0.02, seed=0):
+def adjusted(scene, silent=(), noise=0.5, degrees=1.0, shift=0.02, seed=0, chance=lambda i, j: 0.95):
     """A bundle adjustment of poses that are a little off; ``silent`` cameras have no matches."""
     features = scene.features(noise=noise, seed=seed)
     geometries = {}
     for i, j in itertools.combinations(range(len(features)), 2):
         rotation, direction = scene.relative(i, j)
         pose = RelativePose(rotation, direction, 1e-4 * np.eye(3), 1e-4 * np.eye(3), 1.0)
-        found = TwoViewGeometry((pose,), match(features[i], features[j]), 0.95)
+        found = TwoViewGeometry((pose,), match(features[i], features[j]), chance(i, j))
         geometries[i, j] = NOTHING if i in silent or j in silent else found
     generator = np.random.default_rng([seed, 2])
     turns = np.radians(degrees) * generator.standard_normal((len(scene.rotations), 3))
@@ -114,3 +114,19 @@ def test_axes_that_hardly_meet_leave_origin_and_unit_as_they_were(point_scene):
     known = joined(np.tile(np.diag([0.002**2] * 3 + [math.radians(5) ** 2] * 3), (3, 1, 1)))
     centres, _ = settle(refined, known)
     np.testing.assert_array_equal(centres, cameras.camera_centre(refined.rotations, refined.translations))
+
+
+def test_matches_that_are_not_sure_leave_it_to_what_was_known_how_groups_go_together(point_scene):
+    """Two pairs of cameras that share points, tied by matches as likely wrong as not."""
+    scene = point_scene.ring(ANGLES)
+    sure, unsure = (adjusted(scene, chance=lambda i, j, c=c: c if i < 2 <= j else 0.95) for c in (0.95, 0.6))
+    assert sure.groups == ((0, 1, 2, 3),)
+    assert unsure.groups == ((0, 1), (2, 3))
+    np.testing.assert_array_equal(sure.rotations, unsure.rotations)
+    for camera in (2, 3):
+        known, guessed = (apart(settle(each, before(4))[1])[camera] for each in (sure, unsure))
+        assert np.trace(known[3:, 3:]) < 0.1 * np.trace(BEFORE[3:, 3:])
+        assert np.trace(guessed[3:, 3:]) == pytest.approx(np.trace(BEFORE[3:, 3:]), rel=0.15)
+    joint = settle(unsure, before(4))[1]
+    relative = joint[15:18, 15:18] + joint[21:24, 21:24] - joint[15:18, 21:24] - joint[21:24, 15:18]
+    assert np.trace(relative) < 0.1 * np.trace(BEFORE[3:, 3:])

@@ -118,6 +118,17 @@ def test_covariance_follows_curvature_and_grows_where_views_are_fewer_tied(fishe
     np.testing.assert_allclose(covariances[2, 3:, 3:], np.eye(3) * 3.0 / 100, atol=0.004)
 
 
+def test_pairs_that_say_nothing_say_no_more_together(fisher_scene, cameras_around):
+    """Cameras tied to each other, and by nothing to the first: each may look any way."""
+    for views, tied in ((3, (1, 2)), (5, (1, 2, 4))):
+        scene = fisher_scene(cameras_around(views, 6), concentration=0.0)
+        for i, j in itertools.combinations(tied, 2):
+            scene.mixtures[i, j] = [(scene.relative(i, j), 0.0, 200.0)]
+        _, covariances, _ = told(scene)
+        for covariance in covariances[1:]:
+            np.testing.assert_allclose(covariance[3:, 3:], UNIFORM_VARIANCE * np.eye(3), rtol=0.15, atol=0.1)
+
+
 @given(
     seed=st.integers(0, 1000),
     views=st.integers(2, 4),
