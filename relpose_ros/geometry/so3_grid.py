@@ -76,6 +76,42 @@ def cell_rotations(level: int, cells: npt.ArrayLike) -> FloatArray:
     return _from_hopf(azimuth, height, turn - belt * azimuth)
 
 
+def cells_at(level: int, rotations: npt.ArrayLike) -> IntArray:
+    """The cells of a level in which rotations lie: `cell_rotations` undone. (..., 3, 3) -> (...) indices."""
+    r = np.asarray(rotations, np.float64)
+    azimuth, height = np.arctan2(r[..., 1, 2], r[..., 0, 2]), r[..., 2, 2]
+    ca, sa = np.cos(azimuth), np.sin(azimuth)
+    # The second row of Rz(-azimuth) R is (sin, cos, .) of the turn also where the z axis goes to a pole.
+    turn = np.arctan2(ca * r[..., 1, 0] - sa * r[..., 0, 0], ca * r[..., 1, 1] - sa * r[..., 0, 1])
+    x, y = _projected(azimuth, height)
+    # Lines along a diamond's edges are a unit apart; floor says which diamond, the rest where in it.
+    east, north = (y + 1 + x) / 2, (y + 1 - x) / 2
+    column, row = np.floor(east).astype(np.int64), np.floor(north).astype(np.int64)
+    belt = column + row
+    quarter = (column - row - np.abs(belt)) // 2 % 4
+    side, tilts = 1 << level, BASE_TILTS << level
+    column = np.clip(((east - column) * side).astype(np.int64), 0, side - 1)
+    row = np.clip(((north - row) * side).astype(np.int64), 0, side - 1)
+    tilt = np.floor((turn + belt * azimuth) * (tilts / (2 * np.pi))).astype(np.int64) % tilts
+    cells = ((1 - belt) * 4 + quarter) * BASE_TILTS + (tilt >> level)
+    for bit in reversed(range(level)):
+        cells = cells * 8 + ((tilt >> bit & 1) << 2 | (row >> bit & 1) << 1 | column >> bit & 1)
+    return np.asarray(cells)
+
+
+def _projected(azimuth: FloatArray, height: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The HEALPix map projection, in units of pi/4: x along the equator, y up, -2 to 2."""
+    x = azimuth * (4 / np.pi)
+    width = np.sqrt(3 * np.maximum(0, 1 - np.abs(height)))  # of a polar diamond at that height
+    polar = width <= 1 + 1e-9
+    middle = 2 * np.floor(x / 2) + 1
+    inside = np.clip(x - middle, 1e-6 - 1, 1 - 1e-6) * np.maximum(width, 1e-6)  # on an edge no floor is safe
+    return (
+        np.where(polar, middle + inside, x),
+        np.where(polar, np.sign(height) * (2 - np.maximum(width, 1e-6)), 1.5 * height),
+    )
+
+
 def _pixel_centre(
     face: IntArray, column: IntArray, row: IntArray, side: int
 ) -> tuple[FloatArray, FloatArray]:

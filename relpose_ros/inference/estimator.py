@@ -31,6 +31,7 @@ from relpose_ros.inference.uncertainty import (
     camera_covariances,
     covariances_of_unknown_trust,
     describe_pairs,
+    heaviest_modes,
     pairs_of_unknown_trust,
 )
 from relpose_ros.inference.verdict import WITHOUT_PROBABILITIES, judge
@@ -257,7 +258,12 @@ class Estimator:
     def _solved(self, scan: Scan) -> _Told:
         """What the pairs' distributions say together."""
         found = self._search(scan)
-        solution = solve(found.joint_energies, found.distributions).rotations[0]
+        known = found.distributions
+        if len(scan.views) == 2 and self._calibration is not None:
+            # Two views have nothing to be joined to: where probabilities hold, the most of them counts, and
+            # not the highest density, which a narrow peak has that is hardly ever right.
+            known = heaviest_modes(known)
+        solution = solve(found.joint_energies, known).rotations[0]
         translations = predicted_translations(self._network, found.features, solution.numpy())
         covariances = camera_covariances(
             found.distributions, found.energies, solution, translations, found.calibration

@@ -4,19 +4,24 @@ Cameras join in the order of a maximum spanning tree over the pairs' modes. Wher
 rotation per camera (the best mode along the tree), a beam of partial solutions is kept here, each camera
 tried at every mode of every pair that ties it to those already placed. The best ends climb, all rotations
 together along the gradient. Where pairs still contradict each other, beams grow from the other cameras too,
-cameras jump to other modes, and the best climb by block coordinate ascent with a shrinking neighbourhood.
+and cameras jump to other hills. The best end is polished by a search of shrinking neighbourhoods.
+
+All cameras are tried at once, each against the others as they are; `_moved` then says which of them move
+together. So a step costs a few calls of many rotations instead of many calls of few.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
-from relpose_ros.geometry import so3
-from relpose_ros.inference.pair_distribution import ascend, peaks, pick
+from relpose_ros.geometry import so3, so3_grid
+from relpose_ros.inference.pair_distribution import ascend, peaks, pick, uphill
 
 if TYPE_CHECKING:
     from relpose_ros.inference.pair_distribution import PairDistributions
@@ -30,38 +35,55 @@ class AscentSettings:
     full_scan: int = 28
     """Pairs that those numbers are meant for, 8 views."""
     most: int = 64
-    beam: int = 20
+    beam: int = 8
     """Partial solutions kept while cameras join."""
-    screened: int = 100
-    """Ways to add a camera to the beam that are evaluated, the best by what the coarse grid remembers."""
-    starts: int = 8
-    """Complete solutions that climb."""
+    screened: int = 5
+    """Ways to add a camera that are evaluated for each one kept, the best by the coarse grid's memory."""
+    modes: int = 8
+    """Modes of each pair at which a camera may join, the highest."""
+    starts: int = 4
+    """Complete solutions that climb, and are reported."""
     climb_stride: float = math.radians(8)
     """First step of a climb, rad."""
     climb_steps: int = 16
-    content: float = 1.5
+    content: float = 0.5
     """Nats a pair. Where the pairs of a scan, or of a camera, are on average this near to their highest
     modes, no other place is looked for: the best could gain no more. Scans whose pairs agree become cheap."""
-    jumpers: int = 3
-    """Solutions whose cameras may leave for any mode of their pairs."""
-    hops: int = 6
-    """Modes considered for such a camera; and cells of the coarse grid, as many."""
-    hop_steps: int = 6
-    """Gradient steps at each before they are compared."""
+    torn: float = 1.5
+    """The same: beyond it, two cameras join anew and solutions are refined before they are compared."""
+    jumps: int = 4
+    """Times that cameras may leave for another hill, while that gains anything."""
+    jumpers: int = 2
+    """Solutions whose cameras may leave for another hill, one by one and two by two."""
+    hops: int = 24
+    """Places considered for a single camera, the best by what the coarse grid remembers."""
+    hills: int = 2
+    """The best of them, which climb before they are compared."""
+    hop_stride: float = math.radians(3)
+    """First step of that climb, rad."""
+    hop_steps: int = 4
+    rounds: float = 2
+    """Times that any two cameras join anew, while that gains anything."""
+    joining: int = 2
+    """Partial solutions kept while two cameras join anew."""
     finalists: int = 2
-    """Solutions that are refined, and"""
-    reach: float = 0.25
-    """nats a pair by which they may lie below the best one."""
-    radii: tuple[float, ...] = tuple(math.radians(a) for a in (12, 6, 3, 6, 4, 3, 2, 1))
-    """Neighbourhood of each sweep over their cameras, rad; wider again once all have moved."""
-    last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (2, 1.5, 1, 0.5, 0.25, 0.12, 0.06))
-    """The same for the winner alone, at the end."""
+    """Solutions that are refined."""
+    turns: float = 0.4
+    """Times that they are, each time in other directions, at least once."""
+    radii: tuple[float, ...] = tuple(math.radians(a) for a in (12, 6, 3))
+    """Neighbourhood of each sweep over their cameras, rad."""
+    winners: int = 4
+    """Solutions that are polished at the end, and"""
+    polishes: int = 5
+    """how many times; both are one for a full scan."""
+    last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (10, 6, 4, 3, 2, 1, 0.5, 0.2, 0.08))
+    """Neighbourhood of each of those sweeps, rad."""
     distinct: float = math.radians(10)
     """Solutions are different where some camera differs by more, rad."""
 
-    def many(self, count: int, pairs: int) -> int:
+    def many(self, count: float, pairs: int) -> int:
         """A number of solutions for so many pairs: the fewer these are, the less a solution costs."""
-        return min(self.most, round(count * self.full_scan / pairs))
+        return max(1, min(self.most, round(count * self.full_scan / pairs)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,34 +107,60 @@ def solve(
     energies: PairEnergies, distributions: PairDistributions, settings: AscentSettings = AscentSettings()
 ) -> JointSolutions:
     """The joint maximum and the other local maxima that were met on the way."""
-    count = settings.many(settings.starts, energies.count)
-    jumping = settings.many(settings.jumpers, energies.count)
-    grown = _grow(energies, distributions, 0, settings)
-    starts, scores = _climbed(energies, grown, jumping, settings)
-    refined, rounds = starts[:0], 0
-    if distributions.mode_energies[:, 0].sum() - scores[0] > settings.content * energies.count:
+    count, jumpers = (settings.many(each, energies.count) for each in (settings.starts, settings.jumpers))
+    # The energies that are added up may weigh less than those that the modes were found in.
+    tops = energies.at(torch.arange(energies.count), distributions.modes[:, :1])[:, 0].double()
+    grown = _grown(energies, distributions, [0], settings)
+    found, scores = _climbed(energies, grown, jumpers, settings)
+    ceiling = tops.sum()
+    if ceiling - scores[0] > settings.content * energies.count:
         # One beam favours what its first pairs agree on: each camera's turn as the root has another order.
-        roots = range(1, energies.views)
-        more = [_grow(energies, distributions, root, settings) for root in roots]
-        starts, _ = _climbed(energies, grown, count, settings)
-        starts, _ = _climbed(energies, torch.cat([starts, *more]), count, settings)
-        jumped = torch.cat([_jump(energies, distributions, starts[:jumping], settings), starts])
-        finalists = settings.many(settings.finalists, energies.count)
-        refined, scores = _best(energies, jumped, finalists, settings.distinct)
-        refined = refined[scores > scores[0] - settings.reach * energies.count]
+        more = _grown(energies, distributions, list(range(1, energies.views)), settings)
+        found, _ = _climbed(energies, torch.cat([found, grown, more]), count, settings)
+        best, scores = found, joint_scores(energies, found)
+        for _ in range(settings.jumps):
+            before = scores[0]
+            jumped = _jumped(energies, distributions, best[:jumpers], tops, settings)
+            best, scores = _climbed(energies, torch.cat([best, jumped]), jumpers, settings)
+            if scores[0] <= before:
+                break
+        if ceiling - scores[0] > settings.torn * energies.count:
+            best = _refined(energies, distributions, best, scores, settings)
+        # All may end on one hill: where they started is kept beside, for a runner-up to be told.
+        found, _ = _best(energies, torch.cat([best, found]), count, settings.distinct)
+    last, polishes = (
+        min(most, settings.many(1, energies.count)) for most in (settings.winners, settings.polishes)
+    )
+    winners = found[:last]
+    for turn in range(polishes):
+        for radius in settings.last_radii:
+            winners = _swept(energies, winners, radius, float(turn))
+    return JointSolutions(*_best(energies, torch.cat([winners, found[last:]]), count, settings.distinct))
+
+
+def _refined(
+    energies: PairEnergies,
+    distributions: PairDistributions,
+    best: torch.Tensor,
+    scores: torch.Tensor,
+    settings: AscentSettings,
+) -> torch.Tensor:
+    """Solutions with any two cameras joined anew, the best of them refined. (S, N, 3, 3) -> the same."""
+    jumpers, finalists, turns, rounds = (
+        settings.many(each, energies.count)
+        for each in (settings.jumpers, settings.finalists, settings.turns, settings.rounds)
+    )
+    for _ in range(rounds):
+        before = scores[0]
+        joined = _rejoined(energies, distributions, best, settings)
+        best, scores = _climbed(energies, torch.cat([best, joined]), jumpers, settings)
+        if scores[0] <= before:
+            break
+    best = best[:finalists]
+    for turn in range(turns):
         for radius in settings.radii:
-            refined = _sweep(energies, refined, radius)
-        rounds = settings.many(1, energies.count) - 1
-    # Jumps may all end on one hill: where they started is kept beside, for a runner-up to be told.
-    rotations, _ = _best(energies, torch.cat([refined, starts]), count, settings.distinct)
-    winner = rotations[:1]
-    for turn in range(rounds):  # where pairs are few, which costs little, ripples are searched more than once
-        for radius in settings.radii:
-            winner = _sweep(energies, winner, radius, turn + 1.0)
-    for radius in settings.last_radii:
-        winner = _sweep(energies, winner, radius)
-    rotations, scores = _best(energies, torch.cat([winner, rotations[1:]]), count, settings.distinct)
-    return JointSolutions(rotations, scores)
+            best = _swept(energies, best, radius, float(turn))
+    return best
 
 
 def _climbed(
@@ -124,6 +172,24 @@ def _climbed(
     return _best(energies, rotations, count, settings.distinct)
 
 
+def _climb(energies: PairEnergies, rotations: torch.Tensor, stride: float, steps: int) -> torch.Tensor:
+    """Climbs all rotations together along the joint gradient (Adam's scaling, best point kept)."""
+    here, best = rotations, rotations
+    best_score = torch.full((len(rotations),), -math.inf, dtype=torch.float64)
+    first = torch.zeros(*rotations.shape[:2], 3, dtype=torch.float64)
+    second = torch.zeros_like(first)
+    for step in range(steps + 1):
+        scores, slope = uphill(lambda each: joint_scores(energies, each), here)
+        better = scores > best_score
+        best = torch.where(better[:, None, None, None], here, best)
+        best_score = torch.where(better, scores, best_score)
+        first = 0.8 * first + 0.2 * slope
+        second = 0.95 * second + 0.05 * slope**2
+        scale = (first / (1 - 0.8 ** (step + 1))) / ((second / (1 - 0.95 ** (step + 1))).sqrt() + 1e-9)
+        here = so3.exp_tensor(stride * (1 - step / steps) * scale) @ here
+    return best
+
+
 def _best(
     energies: PairEnergies, rotations: torch.Tensor, count: int, angle: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -132,9 +198,9 @@ def _best(
     -> (<= count, N, 3, 3), (<= count,).
     """
     rotations = rotations @ rotations[:, :1].mT
-    scores = joint_scores(energies, rotations)
-    keep = _distinct(rotations, scores, count, angle)
-    return rotations[keep], scores[keep]
+    keep, scores = peaks(rotations[None], joint_scores(energies, rotations)[None], count, angle)
+    found = scores[0] > -math.inf
+    return rotations[keep[0, found]], scores[0, found]
 
 
 def spanning_order(strengths: torch.Tensor, pair_of: torch.Tensor, root: int = 0) -> list[int]:
@@ -145,93 +211,161 @@ def spanning_order(strengths: torch.Tensor, pair_of: torch.Tensor, root: int = 0
         pair_of: (N, N) position of each pair.
         root: the camera to begin with.
     """
-    table = strengths[pair_of].fill_diagonal_(-math.inf)
+    table = strengths[pair_of].fill_diagonal_(-math.inf).tolist()
     order = [root]
     left = [camera for camera in range(len(table)) if camera != root]
     while left:
-        reach = [float(table[order, camera].max()) for camera in left]
+        reach = [max(table[placed][camera] for placed in order) for camera in left]
         order.append(left.pop(reach.index(max(reach))))
     return order
 
 
-def _grow(
-    energies: PairEnergies, distributions: PairDistributions, root: int, settings: AscentSettings
+def _grown(
+    energies: PairEnergies, distributions: PairDistributions, roots: list[int], settings: AscentSettings
 ) -> torch.Tensor:
-    """A beam of complete starts. -> (B, N, 3, 3)."""
-    order = spanning_order(distributions.mode_log_densities[:, 0], energies.pair_of, root)
+    """Complete starts, a beam of them from each root. -> (B, N, 3, 3)."""
+    strengths = distributions.mode_log_densities[:, 0]
+    orders = torch.tensor([spanning_order(strengths, energies.pair_of, root) for root in roots])
+    alone = torch.eye(3, dtype=torch.float64).expand(len(roots), energies.views, 3, 3)
     width = settings.many(settings.beam, energies.count)
-    beam = torch.eye(3, dtype=torch.float64).expand(1, energies.views, 3, 3).clone()
-    scores = torch.zeros(1, dtype=torch.float64)
-    for position in range(1, len(order)):
-        camera, placed = order[position], order[:position]
-        candidates = _mode_candidates(energies, distributions, beam, camera, placed)  # (B, C, 3, 3)
-        parents = torch.arange(len(beam)).repeat_interleave(candidates.shape[1])
-        candidates = candidates.flatten(0, 1)
-        if len(candidates) > settings.screened:
-            guesses = _remembered(
-                energies, distributions, beam, camera, placed, candidates.view(len(beam), -1, 3, 3)
-            )
-            by_guess = torch.argsort((scores[:, None] + guesses).flatten(), descending=True, stable=True)
-            parents, candidates = (each[by_guess[: settings.screened]] for each in (parents, candidates))
-        grown = beam[parents]
-        gains = _conditional(energies, grown, camera, placed, candidates[:, None])[:, 0]
-        grown[:, camera] = candidates
-        totals = scores[parents] + gains
-        keep = _distinct(grown[:, order[: position + 1]], totals, width, settings.distinct)
-        beam, scores = grown[keep], totals[keep]
-    return beam
+    return _grow(energies, distributions, alone, orders, 1, width, settings)
+
+
+def _rejoined(
+    energies: PairEnergies,
+    distributions: PairDistributions,
+    rotations: torch.Tensor,
+    settings: AscentSettings,
+) -> torch.Tensor:
+    """Solutions with any two cameras taken out and joined anew. (S, N, 3, 3) -> (B, N, 3, 3)."""
+    placed = max(1, energies.views - 2)
+    width = settings.many(settings.joining, energies.count)
+    orders = [
+        [camera for camera in range(energies.views) if camera not in out] + list(out)
+        for out in itertools.combinations(range(energies.views), energies.views - placed)
+    ]
+    starts = rotations.repeat_interleave(len(orders), 0)
+    every = torch.tensor(orders).repeat(len(rotations), 1)
+    return _grow(energies, distributions, starts, every, placed, width, settings)
+
+
+def _grow(
+    energies: PairEnergies,
+    distributions: PairDistributions,
+    starts: torch.Tensor,
+    orders: torch.Tensor,
+    placed: int,
+    width: int,
+    settings: AscentSettings,
+) -> torch.Tensor:
+    """Beams of solutions to which cameras join in turn, at the modes of their pairs with those before them.
+
+    Args:
+        energies: of the scan.
+        distributions: of its pairs.
+        starts: (T, N, 3, 3), one for each beam.
+        orders: (T, N) the cameras.
+        placed: how many of them stay where they are at the start.
+        width: partial solutions kept in each beam.
+        settings: how many are evaluated for it.
+
+    Returns:
+        (B, N, 3, 3), those of all beams.
+    """
+    beams = starts[:, None]
+    scores = torch.zeros(beams.shape[:2], dtype=torch.float64)
+    trees = torch.arange(len(beams))[:, None]
+    for position in range(placed, energies.views):
+        cameras, others = orders[:, position], orders[:, :position]
+        modes = distributions.modes[:, : settings.modes]
+        candidates = _mode_candidates(energies, modes, beams, cameras, others)  # (T, B, C, 3, 3)
+        guesses = scores[..., None] + _remembered(energies, distributions, beams, cameras, others, candidates)
+        # Lower modes beside higher ones come last, where there is still room.
+        heights = distributions.mode_energies[energies.pair_of[cameras[:, None], others], : settings.modes]
+        guesses = guesses.masked_fill((heights == -math.inf).flatten(1)[:, None], -math.inf).flatten(1)
+        chosen = guesses.sort(dim=1, descending=True, stable=True).indices[:, : settings.screened * width]
+        parents, places = chosen // candidates.shape[2], pick(candidates.flatten(1, 2), chosen)
+        gains = _conditional(energies, beams[trees, parents], cameras, others, places[:, :, None])[..., 0]
+        totals = scores.gather(1, parents) + gains
+        beams = beams[trees, parents]
+        beams[trees, torch.arange(chosen.shape[1]), cameras[:, None]] = places
+        keep, scores = peaks(beams, totals, width, settings.distinct)
+        beams = beams[trees, keep]
+    return beams[scores > -math.inf]
 
 
 def _mode_candidates(
     energies: PairEnergies,
-    distributions: PairDistributions,
+    modes: torch.Tensor,
     rotations: torch.Tensor,
-    camera: int,
-    others: list[int],
+    cameras: torch.Tensor,
+    others: torch.Tensor,
 ) -> torch.Tensor:
-    """Where the modes of its pairs with the others would put a camera. (S, N, 3, 3) -> (S, C, 3, 3)."""
-    parts = []
-    for other in others:
-        pair = int(energies.pair_of[camera, other])
-        modes = distributions.modes[pair][distributions.mode_energies[pair] > -math.inf]
-        camera_from_other = modes if camera > other else modes.mT
-        parts.append(camera_from_other @ rotations[:, other, None])
-    return torch.cat(parts, 1)
+    """Where modes (P, M, 3, 3) of its pairs would put a camera; see `_conditional`. -> (G, S, C, 3, 3)."""
+    modes = modes[energies.pair_of[cameras[:, None], others]]  # (G, O, M, 3, 3)
+    forward = (cameras[:, None] > others)[..., None, None, None]
+    camera_from_other = torch.where(forward, modes, modes.mT)[:, None]
+    placed = rotations[torch.arange(len(cameras))[:, None], :, others].transpose(1, 2)
+    return (camera_from_other @ placed[:, :, :, None]).flatten(2, 3)
+
+
+def _relative(
+    rotations: torch.Tensor, cameras: torch.Tensor, others: torch.Tensor, candidates: torch.Tensor
+) -> torch.Tensor:
+    """Relative rotations of a camera's pairs, each in the order of its views; see `_conditional`.
+
+    -> (G, O, S, C, 3, 3).
+    """
+    placed = rotations[torch.arange(len(cameras))[:, None], :, others][:, :, :, None]  # (G, O, S, 1, 3, 3)
+    forward = (cameras[:, None] > others)[..., None, None, None, None]
+    relative = candidates[:, None] @ placed.mT  # camera from other
+    return torch.where(forward, relative, relative.mT)
 
 
 def _conditional(
-    energies: PairEnergies, rotations: torch.Tensor, camera: int, others: list[int], candidates: torch.Tensor
+    energies: PairEnergies,
+    rotations: torch.Tensor,
+    cameras: torch.Tensor,
+    others: torch.Tensor,
+    candidates: torch.Tensor,
 ) -> torch.Tensor:
     """Energy of one camera's pairs at each candidate, the others held.
 
-    (S, N, 3, 3) and (S, C, 3, 3) -> (S, C).
+    Args:
+        energies: of the scan.
+        rotations: (G, S, N, 3, 3).
+        cameras: (G,), the camera of each group.
+        others: (G, O), those that hold it.
+        candidates: (G, S, C, 3, 3).
+
+    Returns:
+        (G, S, C) float64.
     """
-    pairs = energies.pair_of[camera, others]
-    placed = rotations[:, others].transpose(0, 1)[:, :, None]  # (O, S, 1, 3, 3)
-    relative = candidates @ placed.mT  # (O, S, C, 3, 3): camera from other
-    forward = torch.tensor([camera > other for other in others])[:, None, None, None, None]
-    relative = torch.where(forward, relative, relative.mT)
-    return energies.at(pairs, relative.flatten(1, 2)).double().sum(0).view(candidates.shape[:2])
+    relative = _relative(rotations, cameras, others, candidates)
+    pairs = energies.pair_of[cameras[:, None], others].flatten()
+    values = energies.at(pairs, relative.flatten(2, 3).flatten(0, 1))
+    return values.double().view(relative.shape[:4]).sum(1)
 
 
-def _distinct(rotations: torch.Tensor, scores: torch.Tensor, count: int, angle: float) -> torch.Tensor:
-    """Positions of the best solutions of which no two agree in all cameras, best first.
+def _remembered(
+    energies: PairEnergies,
+    distributions: PairDistributions,
+    rotations: torch.Tensor,
+    cameras: torch.Tensor,
+    others: torch.Tensor,
+    candidates: torch.Tensor,
+) -> torch.Tensor:
+    """What the coarse grid remembers of `_conditional`; no energy is evaluated. -> (G, S, C)."""
+    relative = _relative(rotations, cameras, others, candidates)
+    cells = torch.from_numpy(so3_grid.cells_at(distributions.coarse_level, relative.numpy()))
+    known = distributions.coarse[energies.pair_of[cameras[:, None], others]]  # (G, O, cells)
+    return known.gather(2, cells.flatten(2)).view(cells.shape).sum(1)
 
-    (S, N, 3, 3) and (S,) -> (<= count,).
-    """
-    least_trace = 1 + 2 * math.cos(angle)
-    flat = rotations.flatten(2)  # (S, N, 9)
-    left = scores.clone()
-    keep: list[int] = []
-    while len(keep) < count:
-        best = int(left.argmax())
-        if left[best] == -math.inf:
-            break
-        keep.append(best)
-        traces = (flat * flat[best]).sum(-1).min(1).values
-        left = left.masked_fill(traces > least_trace, -math.inf)
-        left[best] = -math.inf
-    return torch.tensor(keep)
+
+def _others(views: int) -> torch.Tensor:
+    """(N, N - 1): beside each camera all others."""
+    cameras = torch.arange(views)
+    return cameras.expand(views, -1)[cameras != cameras[:, None]].view(views, views - 1)
 
 
 def _neighbourhood() -> torch.Tensor:
@@ -247,120 +381,92 @@ def _neighbourhood() -> torch.Tensor:
 _NEIGHBOURHOOD = _neighbourhood()
 
 
-def _jump(
+def _jumped(
     energies: PairEnergies,
     distributions: PairDistributions,
     rotations: torch.Tensor,
+    tops: torch.Tensor,
     settings: AscentSettings,
 ) -> torch.Tensor:
-    """Moves every camera in turn to the best hill, wherever it is. (S, N, 3, 3) -> (S, N, 3, 3).
+    """Moves cameras to the best hills, wherever they are. (S, N, 3, 3) -> (B, N, 3, 3), see `_moved`.
 
     Modes of its pairs and cells of the coarse grid only say where to start climbing: what all pairs of a
     camera agree on may be the top of none of them.
     """
-    rotations = rotations.clone()
-    for camera in range(energies.views):
-        others = [other for other in range(energies.views) if other != camera]
-        ceiling = distributions.mode_energies[energies.pair_of[camera, others], 0].sum()
-        now = _conditional(energies, rotations, camera, others, rotations[:, camera, None])[:, 0]
-        restless = (ceiling - now > settings.content * len(others)).nonzero()[:, 0]
-        if len(restless) == 0:
-            continue
-        moving = rotations[restless]
-        modes = _mode_candidates(energies, distributions, moving, camera, others)
-        gains = _conditional(energies, moving, camera, others, modes)
-        cells = distributions.coarse_rotations.expand(len(moving), -1, -1, -1)
-        guesses = _remembered(energies, distributions, moving, camera, others, cells)
-        starts = torch.cat(
-            [
-                pick(modes, peaks(modes, gains, settings.hops, settings.distinct)[0]),
-                pick(cells, peaks(cells, guesses, settings.hops, settings.distinct)[0]),
-            ],
-            1,
-        )
-        hills, heights = _climb_camera(energies, moving, camera, others, starts, settings)
-        hills = torch.cat([moving[:, camera, None], hills], 1)
-        heights = torch.cat([now[restless, None], heights], 1)
-        rotations[restless, camera] = hills[torch.arange(len(moving)), heights.argmax(1)]
-    return rotations
+    cameras, others = torch.arange(energies.views), _others(energies.views)
+    every, here = _each_camera(rotations, cameras)
+    now = _conditional(energies, every, cameras, others, here)
+    ceilings = tops[energies.pair_of[cameras[:, None], others]].sum(1)
+    restless = ceilings - now.amin((1, 2)) > settings.content * others.shape[1]
+    if not restless.any():
+        return rotations
+    cameras, others, every, here, now = (each[restless] for each in (cameras, others, every, here, now))
+    cells = torch.from_numpy(np.array(so3_grid.grid(distributions.coarse_level)))
+    modes = _mode_candidates(energies, distributions.modes, every, cameras, others)
+    places = torch.cat([modes, cells.expand(*every.shape[:2], -1, -1, -1)], 2)
+    guesses = _remembered(energies, distributions, every, cameras, others, places)
+    places = _highest(places, guesses, settings.many(settings.hops, energies.count), settings.distinct)
+    gains = _conditional(energies, every, cameras, others, places)
+    starts = _highest(places, gains, settings.many(settings.hills, energies.count), settings.distinct)
+
+    def height(rotations: torch.Tensor) -> torch.Tensor:
+        return _conditional(energies, every, cameras, others, rotations.view_as(starts)).flatten()
+
+    strides = torch.full((starts[..., 0, 0].numel(),), settings.hop_stride, dtype=torch.float64)
+    hills, heights = ascend(height, starts.flatten(0, 2), strides, settings.hop_steps)
+    places = torch.cat([here, hills.view_as(starts)], 2)
+    heights = torch.cat([now, heights.view(starts.shape[:3])], 2)
+    return _moved(rotations, cameras, places, heights).flatten(0, 1)
 
 
-def _climb_camera(
-    energies: PairEnergies,
-    rotations: torch.Tensor,
-    camera: int,
-    others: list[int],
-    starts: torch.Tensor,
-    settings: AscentSettings,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Climbs one camera from each of its starts, the others held. (S, C, 3, 3) -> the same, and (S, C)."""
-
-    def height(places: torch.Tensor) -> torch.Tensor:
-        return _conditional(energies, rotations, camera, others, places.view_as(starts)).flatten()
-
-    strides = torch.full((starts.shape[0] * starts.shape[1],), settings.climb_stride, dtype=torch.float64)
-    hills, heights = ascend(height, starts.flatten(0, 1), strides, settings.hop_steps)
-    return hills.view_as(starts), heights.view(starts.shape[:2])
-
-
-def _remembered(
-    energies: PairEnergies,
-    distributions: PairDistributions,
-    rotations: torch.Tensor,
-    camera: int,
-    others: list[int],
-    candidates: torch.Tensor,
-) -> torch.Tensor:
-    """What the coarse grid remembers of `_conditional`. (S, N, 3, 3) and (S, C, 3, 3) -> (S, C).
-
-    No energy is evaluated: each relative rotation takes the value of the cell that it falls nearest to.
-    """
-    cells = distributions.coarse_rotations.flatten(1).float()
-    totals = torch.zeros(candidates.shape[:2], dtype=torch.float64)
-    for other in others:
-        relative = candidates @ rotations[:, other, None].mT  # (S, C, 3, 3)
-        if camera < other:
-            relative = relative.mT
-        likeness = relative.flatten(2).float() @ cells.T  # traces; numpy finds their maxima ten times sooner
-        nearest = torch.from_numpy(likeness.numpy().argmax(-1))
-        totals += distributions.coarse[energies.pair_of[camera, other]][nearest]
-    return totals
-
-
-def _sweep(energies: PairEnergies, rotations: torch.Tensor, radius: float, turn: float = 0.0) -> torch.Tensor:
-    """Moves every camera in turn to the best place around it. (S, N, 3, 3) -> (S, N, 3, 3).
+def _swept(energies: PairEnergies, rotations: torch.Tensor, radius: float, turn: float = 0.0) -> torch.Tensor:
+    """Moves cameras to the best places around them. (S, N, 3, 3) -> (S, N, 3, 3).
 
     Places lie at other directions for another ``turn``, rad.
     """
-    rotations = rotations.clone()
+    cameras, others = torch.arange(energies.views), _others(energies.views)
     turned = _NEIGHBOURHOOD @ so3.exp_tensor(torch.tensor([turn, turn, 0.0], dtype=torch.float64))
-    offsets = so3.exp_tensor(turned * radius)  # the first is the identity: no camera gets worse
-    rows = torch.arange(len(rotations))
-    for camera in range(energies.views):
-        others = [other for other in range(energies.views) if other != camera]
-        candidates = offsets @ rotations[:, camera, None]
-        gains = _conditional(energies, rotations, camera, others, candidates)
-        rotations[:, camera] = candidates[rows, gains.argmax(1)]
-    return rotations
+    every, here = _each_camera(rotations, cameras)
+    places = so3.exp_tensor(turned * radius) @ here  # the first is where the camera is
+    heights = _conditional(energies, every, cameras, others, places)
+    moved = _moved(rotations, cameras, places, heights)
+    scores = joint_scores(energies, moved.flatten(0, 1)).view(moved.shape[:2])
+    return moved[torch.arange(len(moved)), scores.argmax(1)]
 
 
-def _climb(energies: PairEnergies, rotations: torch.Tensor, stride: float, steps: int) -> torch.Tensor:
-    """Climbs all rotations together along the joint gradient (Adam's scaling, best point kept)."""
-    here, best = rotations, rotations
-    best_score = torch.full((len(rotations),), -math.inf, dtype=torch.float64)
-    first = torch.zeros(*rotations.shape[:2], 3, dtype=torch.float64)
-    second = torch.zeros_like(first)
-    for step in range(steps + 1):
-        with torch.enable_grad():
-            tangent = torch.zeros_like(first, requires_grad=True)
-            scores = joint_scores(energies, so3.exp_tensor(tangent) @ here)
-            (slope,) = torch.autograd.grad(scores.sum(), tangent)
-        scores = scores.detach()
-        better = scores > best_score
-        best = torch.where(better[:, None, None, None], here, best)
-        best_score = torch.where(better, scores, best_score)
-        first = 0.8 * first + 0.2 * slope
-        second = 0.95 * second + 0.05 * slope**2
-        scale = (first / (1 - 0.8 ** (step + 1))) / ((second / (1 - 0.95 ** (step + 1))).sqrt() + 1e-9)
-        here = so3.exp_tensor(stride * (1 - step / steps) * scale) @ here
-    return best
+def _each_camera(rotations: torch.Tensor, cameras: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Solutions once for each camera, and where it is. (S, N, 3, 3) -> (G, S, N, 3, 3), (G, S, 1, 3, 3)."""
+    return rotations.expand(len(cameras), -1, -1, -1, -1), rotations[:, cameras].transpose(0, 1)[:, :, None]
+
+
+def _highest(places: torch.Tensor, values: torch.Tensor, count: int, angle: float) -> torch.Tensor:
+    """The best distinct ones of a camera's places. (G, S, C, 3, 3), (G, S, C) -> (G, S, <= count, 3, 3)."""
+    flat = places.flatten(0, 1)
+    kept = pick(flat, peaks(flat, values.flatten(0, 1), count, angle)[0])
+    return kept.view(*places.shape[:2], -1, 3, 3)
+
+
+def _moved(
+    rotations: torch.Tensor, cameras: torch.Tensor, places: torch.Tensor, heights: torch.Tensor
+) -> torch.Tensor:
+    """Solutions with no camera moved, with the one that gains most at its best place, with two, and so on.
+
+    What a camera gains holds while the others stay, so that it may be one too many.
+
+    Args:
+        rotations: (S, N, 3, 3).
+        cameras: (G,).
+        places: (G, S, C, 3, 3) for each camera, the first where it is.
+        heights: (G, S, C) its energies there.
+
+    Returns:
+        (S, G + 1, N, 3, 3).
+    """
+    solutions = torch.arange(len(rotations))
+    best = heights.argmax(2)  # (G, S)
+    gains = heights.gather(2, best[..., None])[..., 0] - heights[..., 0]
+    order = gains.sort(dim=0, descending=True, stable=True).indices
+    moved = rotations[:, None].repeat(1, len(cameras) + 1, 1, 1, 1)
+    for rank, group in enumerate(order, start=1):
+        moved[solutions, rank:, cameras[group]] = places[group, solutions, best[group, solutions]][:, None]
+    return moved

@@ -55,9 +55,8 @@ class PairDistributions:
     spacings: torch.Tensor
     """(L,) edge of a cell, rad."""
     coarse: torch.Tensor
-    """(P, C) highest energy met in each cell of the coarse level, whose centres are ``coarse_rotations``."""
-    coarse_rotations: torch.Tensor
-    """(C, 3, 3)."""
+    """(P, C) highest energy met in each cell of ``coarse_level``."""
+    coarse_level: int
     modes: torch.Tensor
     """(P, M, 3, 3) local maxima, highest energy first."""
     mode_energies: torch.Tensor
@@ -69,8 +68,16 @@ class PairDistributions:
 
     def masses(self, temperature: float = 1.0, flat: float = 0.0) -> torch.Tensor:
         """Probability of each cell, a share ``flat`` of it uniform; every row sums to one. -> (P, L)."""
-        masses = torch.softmax(self.energies / temperature + self.log_volumes, -1)
-        return masses if flat == 0 else (1 - flat) * masses + flat * self.log_volumes.exp()
+        asked = temperature, flat
+        if asked not in self._masses:
+            masses = torch.softmax(self.energies / temperature + self.log_volumes, -1)
+            self._masses[asked] = masses if flat == 0 else (1 - flat) * masses + flat * self.log_volumes.exp()
+        return self._masses[asked]
+
+    @cached_property
+    def _masses(self) -> dict[tuple[float, float], torch.Tensor]:
+        """Those worked out so far: the pairs and the cameras are told from the same ones."""
+        return {}
 
     @cached_property
     def mode_log_densities(self) -> torch.Tensor:
@@ -111,9 +118,8 @@ def search(
     modes, mode_energies = _refine_modes(
         energies, pick(rotations, tops), heights, spacings[tops] / 2, settings
     )
-    coarse_rotations = _rotations(settings.level, torch.arange(so3_grid.size(settings.level)))
     return PairDistributions(
-        rotations, scores, log_volumes, spacings, coarse, coarse_rotations, modes, mode_energies
+        rotations, scores, log_volumes, spacings, coarse, settings.level, modes, mode_energies
     )
 
 
@@ -133,24 +139,24 @@ def peaks(
     """The highest of some rotations, in each row, of which no two are nearer than ``separation``.
 
     Args:
-        rotations: (P, L, 3, 3).
+        rotations: (P, L, 3, 3); or (P, L, N, 3, 3), of which two are as near as their most distant rotations.
         values: (P, L).
-        count: M, how many to pick in each row.
+        count: M, how many to pick in each row at most.
         separation: rad.
 
     Returns:
-        Positions (P, M) int64, highest first, and values (P, M), -inf where a row has no more.
+        Positions (P, <= M) int64, highest first, and values (P, <= M), -inf where a row has no more.
     """
     least_trace = 1 + 2 * math.cos(separation)
-    flat = rotations.flatten(2)  # (P, L, 9): the trace of A B^T is their scalar product
+    flat = rotations.reshape(*values.shape, -1, 9)  # the trace of A B^T is their scalar product
     left = values.clone()
     rows = torch.arange(len(flat))
     tops, heights = [], []
-    for _ in range(count):
+    for _ in range(min(count, values.shape[1])):
         best = left.argmax(1)
         tops.append(best)
         heights.append(left[rows, best])
-        traces = torch.einsum("pla,pa->pl", flat, flat[rows, best])
+        traces = torch.einsum("plna,pna->pln", flat, flat[rows, best]).amin(2)
         left = left.masked_fill(traces > least_trace, -math.inf)
         left[rows, best] = -math.inf
     return torch.stack(tops, 1), torch.stack(heights, 1)
@@ -200,12 +206,12 @@ def ascend(
         Rotations (Q, 3, 3) and heights (Q,), none lower than at the start.
     """
     here = rotations
-    value, slope = _slope(height, here)
+    value, slope = uphill(height, here)
     length = strides
     for _ in range(steps):
         direction = slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-12)
         there = so3.exp_tensor(direction * length[:, None]) @ here
-        new_value, new_slope = _slope(height, there)
+        new_value, new_slope = uphill(height, there)
         better = new_value > value
         here = torch.where(better[:, None, None], there, here)
         slope = torch.where(better[:, None], new_slope, slope)
@@ -214,12 +220,20 @@ def ascend(
     return here, value
 
 
-def _slope(
+def uphill(
     height: Callable[[torch.Tensor], torch.Tensor], rotations: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Heights (Q,) and their gradients (Q, 3) for left perturbations of the rotations."""
+    """Heights and their gradients for left perturbations. (Q, ..., 3, 3) -> (Q,) float64, (Q, ..., 3).
+
+    Args:
+        height: of each start, (Q, ..., 3, 3) -> (Q,), differentiable.
+        rotations: (Q, ..., 3, 3) float64; several of one start have one height.
+    """
     with torch.enable_grad():
-        tangent = torch.zeros(len(rotations), 3, dtype=torch.float64, requires_grad=True)
-        value = height(so3.exp_tensor(tangent) @ rotations)
-        (slope,) = torch.autograd.grad(value.sum(), tangent)
-    return value.detach().double(), slope
+        entries = rotations.detach().requires_grad_()
+        value = height(entries)
+        (gradient,) = torch.autograd.grad(value.sum(), entries)
+    # d tr(G^T exp(w) R) / dw at zero is the axis of the skew part of G R^T.
+    turns = gradient @ rotations.mT
+    skew = turns - turns.mT
+    return value.detach().double(), torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)

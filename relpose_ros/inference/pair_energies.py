@@ -26,6 +26,8 @@ COARSE_LEVEL = 1
 LAST_KEPT_LEVEL = 2
 """Whole levels are kept up to this one: 5 MB at the published size. The next would be 38 MB, of which a scan
 looks at a few per cent."""
+NORMALISED = (32, 8)
+"""Cells of the coarse level, and of the one below, that are split to normalise a distribution."""
 ROWS = 1024
 """Rotations scored in one go: 1024 rows of 256 floats are 1 MB, and stay in a core's cache between layers."""
 
@@ -95,6 +97,8 @@ class PairEnergies:
     """Share of the uniform distribution in that mixture."""
     weight: float = 1.0
     """Of the network's part in the sum with the evidence."""
+    coarse: torch.Tensor | None = None
+    """(P, 72 * 8^COARSE_LEVEL) the network's own energies of that level, where they are known."""
 
     @classmethod
     def of(
@@ -135,20 +139,30 @@ class PairEnergies:
     def mixed(self, grid: GridEmbeddings, flat: float) -> PairEnergies:
         """Log-densities relative to uniform of a mixture: the network's distribution and the uniform one.
 
-        A network that is plainly wrong about some pairs must not rule anything out by itself. The coarse
-        level is enough to normalise its smooth energies.
+        A network that is plainly wrong about some pairs must not rule anything out by itself.
 
         Args:
             grid: the embeddings of the rotation grid.
             flat: share of the uniform distribution, 0 < flat < 1.
         """
-        energies = self.on_grid(grid(COARSE_LEVEL)) / self.temperature
-        log_normalisers = torch.logsumexp(energies, -1) - math.log(energies.shape[-1])
-        return replace(self, log_share=math.log1p(-flat) - log_normalisers, flat=flat)
+        coarse = self.on_grid(grid(COARSE_LEVEL))
+        level, values = COARSE_LEVEL, coarse
+        cells = torch.arange(values.shape[1]).expand(self.count, -1)
+        parts = []
+        for width in NORMALISED:
+            values, order = torch.sort(values, dim=1, descending=True, stable=True)
+            parts.append(values[:, width:] / self.temperature - math.log(so3_grid.size(level)))
+            cells = torch.gather(cells, 1, order[:, :width])
+            cells, level = (cells[..., None] * 8 + torch.arange(8)).flatten(1), level + 1
+            values = self._learned_on_cells(grid, level, cells)
+        parts.append(values / self.temperature - math.log(so3_grid.size(level)))
+        log_normalisers = torch.logsumexp(torch.cat(parts, 1), 1)
+        return replace(self, log_share=math.log1p(-flat) - log_normalisers, flat=flat, coarse=coarse)
 
     def on_level(self, grid: GridEmbeddings, level: int) -> torch.Tensor:
         """Energies of every pair on a whole level. -> (P, 72 * 8^level)."""
-        learned = self._calibrated(self.on_grid(grid(level)), slice(None))
+        known = self.coarse if level == COARSE_LEVEL else None
+        learned = self._calibrated(self.on_grid(grid(level)) if known is None else known, slice(None))
         if self.evidence is None:
             return learned
         rotations = torch.from_numpy(np.array(so3_grid.grid(level)))
@@ -157,11 +171,7 @@ class PairEnergies:
 
     def on_cells(self, grid: GridEmbeddings, level: int, cells: torch.Tensor) -> torch.Tensor:
         """Energies of every pair at its own cells of a level. (P, C) int64 -> (P, C)."""
-        parts = [
-            self.model.pair_energies(self.contexts[part], grid.of_cells(level, cells[part]))
-            for part in _blocks(*cells.shape)
-        ]
-        learned = self._calibrated(torch.cat(parts), slice(None))
+        learned = self._calibrated(self._learned_on_cells(grid, level, cells), slice(None))
         if self.evidence is None:
             return learned
         rotations = torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
@@ -193,6 +203,14 @@ class PairEnergies:
         if self.evidence is None:
             return learned
         return learned + self.evidence(pairs, rotations)
+
+    def _learned_on_cells(self, grid: GridEmbeddings, level: int, cells: torch.Tensor) -> torch.Tensor:
+        """What the network itself gives at every pair's own cells. (P, C) int64 -> (P, C)."""
+        parts = [
+            self.model.pair_energies(self.contexts[part], grid.of_cells(level, cells[part]))
+            for part in _blocks(*cells.shape)
+        ]
+        return torch.cat(parts)
 
     def _calibrated(self, energies: torch.Tensor, pairs: torch.Tensor | slice) -> torch.Tensor:
         """From the network's energies (Q, K) of some pairs to log-likelihoods."""

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from relpose_ros.geometry import so3, so3_grid
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 LEVELS = (0, 1, 2, 3)
 
@@ -87,6 +94,56 @@ def test_single_cells_are_those_of_the_whole_level() -> None:
     cells = np.array([0, 71, 72 * 8 - 1, 300])
     assert np.array_equal(so3_grid.cell_rotations(1, cells), so3_grid.grid(1)[cells])
     assert so3_grid.cell_rotations(6, [72 * 8**6 - 1]).shape == (1, 3, 3)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2, 3])
+def test_every_centre_lies_in_its_own_cell(level: int) -> None:
+    cells = np.arange(so3_grid.size(level))
+    assert np.array_equal(so3_grid.cells_at(level, so3_grid.grid(level)), cells)
+
+
+@given(level=st.integers(0, so3_grid.MAX_LEVEL), share=st.floats(0, 1, exclude_max=True))
+def test_cell_rotations_are_undone_at_all_levels(level: int, share: float) -> None:
+    cell = int(share * so3_grid.size(level))
+    assert so3_grid.cells_at(level, so3_grid.cell_rotations(level, [cell])).tolist() == [cell]
+
+
+def at_poles_and_edges() -> np.ndarray:
+    """Rotations that take the z axis to a pole, or beside one, and to where diamonds meet. -> (K, 3, 3)."""
+    azimuths = np.arange(16) * np.pi / 8
+    heights = np.array([1, 1 - 1e-15, 1 - 1e-9, 1 - 1e-4, 2 / 3, 1 / 3, 0.0])
+    azimuth, height, turn = np.meshgrid(azimuths, np.r_[heights, -heights], [-np.pi, -1.0, 0.0, 2.0])
+    polar = np.arccos(height)
+    about_z, about_y = np.zeros((2, *azimuth.shape, 3))
+    spin = np.zeros_like(about_z)
+    about_z[..., 2], about_y[..., 1], spin[..., 2] = azimuth, polar, turn
+    return (so3.exp(about_z) @ so3.exp(about_y) @ so3.exp(spin)).reshape(-1, 3, 3)
+
+
+def anywhere() -> np.ndarray:
+    return so3.random_rotations(3000, np.random.default_rng(5))
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("rotations", [anywhere, at_poles_and_edges], ids=["anywhere", "poles and edges"])
+def test_a_rotation_lies_near_the_centre_of_its_cell(level: int, rotations: Callable[[], np.ndarray]) -> None:
+    drawn = rotations()
+    cells = so3_grid.cells_at(level, drawn)
+    distance = so3.angle_between(so3_grid.cell_rotations(level, cells), drawn)
+    # A corner is twice as far from the centre as the children's centres are.
+    assert distance.max() < 1.5 * so3_grid.cell_spacing(level)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_cells_of_rotations_nest(level: int) -> None:
+    drawn = anywhere().reshape(60, 50, 3, 3)
+    assert np.array_equal(so3_grid.cells_at(level + 1, drawn) // 8, so3_grid.cells_at(level, drawn))
+
+
+def test_random_rotations_fall_evenly_on_all_cells() -> None:
+    counts = np.bincount(so3_grid.cells_at(1, so3.random_rotations(60_000, np.random.default_rng(2))))
+    expected = 60_000 / so3_grid.size(1)
+    assert ((counts - expected) ** 2 / expected).sum() < 700  # chi squared, 575 degrees of freedom
 
 
 def test_the_shared_grid_cannot_be_written() -> None:

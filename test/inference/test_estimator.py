@@ -135,6 +135,22 @@ def test_other_evidence_on_the_same_weights(network):
     assert len(given._looks) == 0
 
 
+@pytest.mark.parametrize("seed", [1, 13, 20, 22])
+def test_two_views_are_told_as_their_most_probable_mode(network, seed):
+    """Other peaks of these pairs are higher, and narrower: without probabilities the highest one is told."""
+    calibrated, plain = (
+        Estimator(network, calibration, EvidenceSettings("network")).estimate(scan(2 * seed, 2 * seed + 1))
+        for calibration in (Calibration(temperature=0.02), None)
+    )
+    probable = calibrated.pairs[0].modes[0].camera_j_from_camera_i
+    told, highest = (
+        each.cameras[1].object_from_camera.T @ each.cameras[0].object_from_camera
+        for each in (calibrated, plain)
+    )
+    assert so3.angle_between(told, probable) < math.radians(5)
+    assert so3.angle_between(highest, probable) > math.radians(25)
+
+
 @pytest.mark.parametrize("count", [0, 1, 9])
 def test_refuses_what_no_estimate_can_be_made_of(network, count):
     with pytest.raises(ScanError, match=f"'mug' has {count} views; an estimate takes 2 to 8"):

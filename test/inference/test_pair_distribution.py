@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relpose_ros.geometry import so3
-from relpose_ros.inference.pair_distribution import SearchSettings, ascend, peaks, search
+from relpose_ros.inference.pair_distribution import SearchSettings, ascend, peaks, search, uphill
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 
 
@@ -26,6 +27,12 @@ def test_cells_partition_the_rotations(fisher_scene, cameras_around):
     # A partition holds every cell once: no centre comes twice.
     for rotations in found.rotations.numpy():
         assert len(np.unique(rotations.round(9).reshape(-1, 9), axis=0)) == len(rotations)
+
+
+def test_masses_are_worked_out_once(fisher_scene, cameras_around):
+    _, found = searched(fisher_scene(cameras_around(3, 0)))
+    assert found.masses(1.5, 0.1) is found.masses(1.5, 0.1)
+    assert not torch.equal(found.masses(1.5, 0.1), found.masses(1.5))
 
 
 def test_a_flat_energy_is_uniform(fisher_scene, cameras_around):
@@ -71,6 +78,34 @@ def test_peaks_keep_their_distance(fisher_scene):
     chosen = rotations[0, tops[0]].numpy()
     angles = so3.angle_between(chosen[:, None], chosen[None])
     assert angles[~np.eye(5, dtype=bool)].min() > math.radians(40)
+
+
+def test_peaks_of_several_rotations_differ_in_one_of_them():
+    """Solutions of three cameras, all alike but in the last one."""
+    last = torch.from_numpy(so3.exp(np.radians([0.0, 5.0, 25.0, 31.0])[:, None] * np.array([0, 0, 1.0])))
+    solutions = torch.eye(3, dtype=torch.float64).repeat(1, 4, 3, 1, 1)
+    solutions[0, :, 2] = last
+    values = torch.tensor([[2.0, 3.0, 1.0, 0.5]], dtype=torch.float64)
+    tops, heights = peaks(solutions, values, 4, math.radians(10))
+    assert tops[0, :2].tolist() == [1, 2]
+    assert heights[0].tolist() == [3.0, 1.0, -math.inf, -math.inf]
+
+
+def test_a_slope_is_that_of_finite_turns():
+    """Of several rotations that share one height."""
+    target = torch.from_numpy(so3.exp([[0.3, -0.2, 0.4], [-0.5, 0.1, 0.7]]))
+    starts = torch.from_numpy(so3.random_rotations(6, np.random.default_rng(2))).view(3, 2, 3, 3)
+
+    def height(rotations):
+        return torch.einsum("qnab,nab->q", rotations, target) + rotations[:, 0, 0, 1] ** 2
+
+    values, slopes = uphill(height, starts)
+    torch.testing.assert_close(values, height(starts))
+    for k, axis in itertools.product(range(2), range(3)):
+        turn = torch.zeros(2, 3, dtype=torch.float64)
+        turn[k, axis] = 1e-5
+        difference = height(so3.exp_tensor(turn) @ starts) - height(so3.exp_tensor(-turn) @ starts)
+        torch.testing.assert_close(slopes[:, k, axis], difference / 2e-5, atol=1e-6, rtol=0)
 
 
 def test_peaks_say_when_there_are_no_more():

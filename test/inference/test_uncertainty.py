@@ -15,7 +15,13 @@ from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.global_rotations import solve
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
-from relpose_ros.inference.uncertainty import FLOOR, _turns, camera_covariances, describe_pairs
+from relpose_ros.inference.uncertainty import (
+    FLOOR,
+    _turns,
+    camera_covariances,
+    describe_pairs,
+    heaviest_modes,
+)
 from relpose_ros.inference.verdict import judge, without_room
 
 UNCALIBRATED = Calibration()
@@ -47,6 +53,22 @@ def test_a_sharp_pair_has_the_covariance_of_its_density(fisher_scene, cameras_ar
     assert pair.ambiguity_angle == 0
     assert pair.solution_angle < 1e-2
     assert pair.entropy < -3
+
+
+def test_the_heaviest_mode_is_not_the_highest(fisher_scene, cameras_around):
+    """A narrow peak e times as high as a broad one holds a fiftieth of its probability."""
+    scene = fisher_scene(cameras_around(2, 0))
+    broad, narrow = scene.relative(0, 1), so3.exp([0, 2.0, 0]) @ scene.relative(0, 1)
+    scene.mixtures[0, 1] = [(broad, 0.0, 8.0), (narrow, 1.0, 250.0)]
+    with torch.no_grad():
+        energies = PairEnergies.of(scene, scene, 2)
+        distributions = search(energies, GridEmbeddings(scene))
+        heaviest = heaviest_modes(distributions)
+        told = solve(energies, heaviest).rotations[0, 1].numpy()
+    assert math.degrees(so3.angle_between(distributions.modes[0, 0].numpy(), narrow)) < 1
+    assert heaviest.modes.shape == (1, 1, 3, 3)
+    assert heaviest.mode_energies[0, 0] < distributions.mode_energies[0, 0] - 0.5
+    assert math.degrees(so3.angle_between(told, broad)) < 2
 
 
 def test_a_modes_covariance_is_that_of_its_core_and_the_total_one_holds_all(fisher_scene, cameras_around):
