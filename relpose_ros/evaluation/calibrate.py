@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from itertools import cycle, islice
+from itertools import count, cycle, islice
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from relpose_ros.evaluation.protocol import EvaluationError, view_orders
 from relpose_ros.inference.calibration import (
@@ -49,7 +51,8 @@ def calibrate(
     """Fits a calibration, measures it on other scans of the same captures, and stores it with the weights.
 
     Args:
-        groups: Captures by a name. All groups count the same, and so do the captures within one.
+        groups: Captures by a name. All groups count the same; the captures of one take turns, drawn at random
+            where they are more than the scans.
         weights: Network file to calibrate; a calibration that it holds is not looked at.
         output: Safetensors file to write, with all else that ``weights`` says of itself.
         scans: Of each group, to fit on, and again to measure on.
@@ -94,11 +97,14 @@ def calibrate(
 
 
 def _scans(captures: Sequence[PosedViews], seed: int) -> Iterator[tuple[PosedViews, list[int]]]:
-    """Endless scans, the captures in turn, each time round with the next number of views."""
-    for turn, count in enumerate(cycle(VIEWS)):
-        for capture in captures:
+    """Endless scans: each round takes every capture once, in a random order, the numbers of views in turn."""
+    generator = np.random.default_rng(seed)
+    counts = cycle(VIEWS)
+    for turn in count():
+        for k in generator.permutation(len(captures)):
+            capture, views = captures[k], next(counts)
             size = len(capture.camera_from_world)
-            (order,) = view_orders(capture.name, size, count, orders=1, seed=seed * 1_000_003 + turn)
+            (order,) = view_orders(capture.name, size, views, orders=1, seed=seed * 1_000_003 + turn)
             yield capture, order
 
 

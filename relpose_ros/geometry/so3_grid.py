@@ -41,8 +41,9 @@ def grid(level: int) -> FloatArray:
 
 
 def children(cells: npt.ArrayLike) -> IntArray:
-    """Indices, one level down, of the eight cells inside each. (K,) -> (8 K,), parents in order."""
-    return np.asarray(np.asarray(cells, np.int64)[..., None] * 8 + np.arange(8)).reshape(-1)
+    """Indices, one level down, of the eight cells inside each. (..., K) -> (..., 8 K), parents in order."""
+    inside = np.asarray(cells, np.int64)[..., None] * 8 + np.arange(8)
+    return np.asarray(inside.reshape(*inside.shape[:-2], -1))
 
 
 def cell_spacing(level: int) -> float:

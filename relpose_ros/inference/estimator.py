@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -108,7 +109,8 @@ class Estimator:
     """Estimates the camera poses of a scan.
 
     The same scan gives the same answer to the bit, whatever was estimated before it: a view's features are
-    computed from that view alone and kept as long as the view is, and nothing else is remembered.
+    computed from that view alone and kept as long as the view is, a pair's matches as long as both are, and
+    nothing else is remembered.
     Safe to call from several threads; one estimate is made at a time.
 
     A network that regresses poses has no distribution which matches could join and no calibration: its poses
@@ -150,7 +152,7 @@ class Estimator:
 
         Args:
             path: of a weights file; None for the shipped compact weights.
-            threads: for torch, of the whole process; None or 0 leaves torch's own choice.
+            threads: for torch and OpenCV, of the whole process; None or 0 leaves their own choice.
             evidence: what else than the network to rest on.
             backbone_in_bfloat16: sooner on some processors, and less exact.
 
@@ -159,6 +161,10 @@ class Estimator:
         """
         if threads:
             torch.set_num_threads(threads)
+            with contextlib.suppress(ImportError):  # the network alone does without it
+                import cv2
+
+                cv2.setNumThreads(threads)
         network = load_network(path)
         network.backbone_in_bfloat16 = backbone_in_bfloat16
         stored = read_metadata(path).get("calibration")

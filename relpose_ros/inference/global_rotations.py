@@ -145,7 +145,7 @@ def _refined(
     scores: torch.Tensor,
     settings: AscentSettings,
 ) -> torch.Tensor:
-    """Solutions with any two cameras joined anew, the best of them refined. (S, N, 3, 3) -> the same."""
+    """Solutions with any two cameras joined anew, the best of them refined. -> (<= S, N, 3, 3)."""
     jumpers, finalists, turns, rounds = (
         settings.many(each, energies.count)
         for each in (settings.jumpers, settings.finalists, settings.turns, settings.rounds)

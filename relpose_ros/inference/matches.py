@@ -226,7 +226,11 @@ def _of_plane(rays_i: FloatArray, rays_j: FloatArray, pixel: float) -> Poses:
     directions = np.stack(translations)[:, :, 0]
     lengths = np.linalg.norm(directions, axis=1)
     poses = Poses(np.stack(rotations), directions / np.maximum(lengths, 1e-12)[:, None])
-    return poses[(lengths > 1e-6) & (np.linalg.det(poses.rotations) > 0)]
+    # Of points that all but coincide it gives matrices that are no rotations.
+    square = poses.rotations @ poses.rotations.transpose(0, 2, 1)
+    sound = np.isfinite(poses.rotations).all((1, 2)) & (np.abs(square - np.eye(3)).max((1, 2)) < 1e-6)
+    sound &= lengths > 1e-6
+    return poses[sound][np.linalg.det(poses.rotations[sound]) > 0]
 
 
 def _distinct(poses: Poses, costs: FloatArray) -> tuple[Poses, FloatArray]:
@@ -293,7 +297,7 @@ class Matcher:
         return self._features[view]
 
     def geometries(self, views: Sequence[View]) -> dict[tuple[int, int], TwoViewGeometry]:
-        """Of every pair of views i < j, by their positions. What is new is worked out on torch's threads."""
+        """Of every pair of views i < j, by their positions; what is new on as many threads as torch has."""
         pairs = list(itertools.combinations(range(len(views)), 2))
         known = {(i, j): self._pairs.setdefault(views[i], WeakKeyDictionary()) for i, j in pairs}
         new = [(i, j) for i, j in pairs if views[j] not in known[i, j]]

@@ -49,13 +49,13 @@ class PairDistributions:
     rotations: torch.Tensor
     """(P, L, 3, 3) cell centres, camera_j_from_camera_i."""
     energies: torch.Tensor
-    """(P, L) as the network gives them, before any temperature."""
+    """(P, L) as `PairEnergies` gives them, without the blur of the evidence."""
     log_volumes: torch.Tensor
     """(L,) log of the share of SO(3) that a cell fills; the same for every pair."""
     spacings: torch.Tensor
     """(L,) edge of a cell, rad."""
     coarse: torch.Tensor
-    """(P, C) highest energy met in each cell of ``coarse_level``."""
+    """(P, C) highest energy met in each cell of ``coarse_level``, the evidence blurred."""
     coarse_level: int
     modes: torch.Tensor
     """(P, M, 3, 3) local maxima, highest energy first."""
@@ -100,7 +100,7 @@ def search(
         values, order = torch.sort(values, dim=1, descending=True, stable=True)
         cells, ancestors = torch.gather(cells, 1, order), torch.gather(ancestors, 1, order)
         kept.append((level, cells[:, width:], values[:, width:]))
-        cells = (cells[:, :width, None] * 8 + torch.arange(8)).flatten(1)
+        cells = torch.from_numpy(so3_grid.children(cells[:, :width].numpy()))
         ancestors = ancestors[:, :width].repeat_interleave(8, 1)
         level += 1
         values = energies.on_cells(grid, level, cells)

@@ -153,7 +153,7 @@ class PairEnergies:
             values, order = torch.sort(values, dim=1, descending=True, stable=True)
             parts.append(values[:, width:] / self.temperature - math.log(so3_grid.size(level)))
             cells = torch.gather(cells, 1, order[:, :width])
-            cells, level = (cells[..., None] * 8 + torch.arange(8)).flatten(1), level + 1
+            cells, level = torch.from_numpy(so3_grid.children(cells.numpy())), level + 1
             values = self._learned_on_cells(grid, level, cells)
         parts.append(values / self.temperature - math.log(so3_grid.size(level)))
         log_normalisers = torch.logsumexp(torch.cat(parts, 1), 1)

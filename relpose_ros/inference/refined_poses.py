@@ -61,7 +61,7 @@ def settle(refined: Refined, joint: FloatArray) -> tuple[FloatArray, FloatArray]
         # sets the frame; of the others, which erred together, all know as much of that as one.
         others = [slot for slot in group if moved[slot] != 0]
         share[rows_of(others)] = 1 / np.sqrt(max(len(others), 1))
-    told = _each_for_itself(told, [rows_of(group) for group in groups])
+    told = _informative(_each_for_itself(told, [rows_of(group) for group in groups]))
     before = share[:, None] * np.linalg.inv(joint[np.ix_(rows, rows)]) * share
     spread = np.asarray(np.linalg.inv(before + told))
     if 0 in moved:
@@ -88,6 +88,12 @@ def _each_for_itself(information: FloatArray, groups: Sequence[IntArray]) -> Flo
         spread = np.linalg.pinv(information[np.ix_(others, others)], rcond=1e-10, hermitian=True)
         apart[np.ix_(own, own)] = information[np.ix_(own, own)] - across @ spread @ across.T
     return apart
+
+
+def _informative(information: FloatArray) -> FloatArray:
+    """An information matrix without negative parts, which rounding makes of points near a camera's plane."""
+    told, axes = np.linalg.eigh((information + information.T) / 2)
+    return np.asarray(axes * np.maximum(told, 0) @ axes.T)
 
 
 def _by_adjustment(camera_from_object: FloatArray, translation: FloatArray) -> FloatArray:

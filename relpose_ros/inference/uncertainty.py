@@ -370,9 +370,9 @@ def _joint_spread(
         jacobian[:, 3 * i : 3 * i + 3] = -turned
         jacobian[:, 3 * j : 3 * j + 3] = np.eye(3)
         information += jacobian.T @ told @ jacobian
-    joint = np.linalg.inv(information[3:, 3:] / (energies.views / 2)) * calibration.rotation_spread
+    joint = np.linalg.inv(information[3:, 3:] / (energies.views / 2))
     spread = np.zeros((energies.views, 3, 3))
     for camera in range(1, energies.views):
         own = joint[3 * camera - 3 : 3 * camera, 3 * camera - 3 : 3 * camera]
-        spread[camera] = np.linalg.inv(np.linalg.inv(own) + given_back[camera])
+        spread[camera] = calibration.rotation_spread * np.linalg.inv(np.linalg.inv(own) + given_back[camera])
     return spread

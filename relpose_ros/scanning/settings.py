@@ -149,8 +149,8 @@ class ScanSettings:
     )
     threads: int = _setting(
         0,
-        "Threads of the network on the CPU; 0: as many as PyTorch takes by itself. Fewer leave cores to "
-        "others.",
+        "Threads of PyTorch and OpenCV on the CPU; 0: as many as they take by themselves. Fewer leave cores "
+        "to others.",
         limits=(0, 256),
     )
     autostart: bool = _setting(

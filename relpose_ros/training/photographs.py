@@ -11,6 +11,7 @@ import torch
 from tqdm import tqdm
 
 from relpose_ros.captures.scans import PLACE_STRIDE
+from relpose_ros.captures.shards import read_shard
 from relpose_ros.errors import RelPoseError
 from relpose_ros.network.crops import IMAGE_MEAN, IMAGE_STD, crop_view
 
@@ -108,7 +109,7 @@ def write_capture_shards(
     masked_copies: int = 0,
     seed: int = 0,
 ) -> int:
-    """Write a shard of each capture, with a progress bar; those that stand already are left alone.
+    """Write a shard of each capture, with a progress bar; those that stand already are left as they are.
 
     Args:
         folder: Gets a sub-folder per capture, named as it is.
@@ -122,7 +123,8 @@ def write_capture_shards(
         How many captures there were.
 
     Raises:
-        CaptureShardError: There are no copies to make, or two captures have one name.
+        CaptureShardError: There are no copies to make, two captures have one name, or a shard that stands
+            there has crops of another size or number.
     """
     if copies < 1 or not 0 <= masked_copies <= copies:
         text = f"{copies} copies, {masked_copies} of them masked, cannot be made; ask for 1 or more."
@@ -134,8 +136,19 @@ def write_capture_shards(
             raise CaptureShardError(text)
         written.add(capture.name)
         if (folder / capture.name).exists():
+            _check_alike(folder / capture.name, preset, copies)
             continue
         own_seed = zlib.crc32(f"{seed} {capture.name}".encode())
         shard = capture_shard(capture, preset, copies, masked_copies=masked_copies, seed=own_seed)
         write_capture_shard(folder / capture.name, shard)
     return len(written)
+
+
+def _check_alike(folder: Path, preset: Preset, copies: int) -> None:
+    stands, size = read_shard(folder)["images"].shape, preset.image_size
+    if (stands[0], stands[2]) != (copies, size):
+        text = (
+            f"{folder} has {stands[0]} copies of {stands[2]} pixels, not {copies} of {size}: name another "
+            "folder, or remove that one."
+        )
+        raise CaptureShardError(text)

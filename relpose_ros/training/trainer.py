@@ -322,7 +322,7 @@ class Trainer:
         self._optimizer.load_state_dict(state["optimizer"])
         self._scaler.load_state_dict(state["scaler"])
         self.step, self.images, self._seconds = state["step"], state["images"], state["seconds"]
-        self._began = state["began"]
+        self._began = state.get("began")  # missing in files of before it could be anything but random
         if self._rank == 0:
             _cut_curve(self.folder / CURVE, self.step)
 

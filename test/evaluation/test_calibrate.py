@@ -1,12 +1,13 @@
 """A network's calibration is fitted on posed captures and kept with its weights."""
 
+import itertools
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from relpose_ros.evaluation.calibrate import VIEWS, calibrate, calibration_table
+from relpose_ros.evaluation.calibrate import VIEWS, _scans, calibrate, calibration_table
 from relpose_ros.evaluation.protocol import EvaluationError, PosedViews
 from relpose_ros.geometry.cameras import look_at, translation_of
 from relpose_ros.inference.calibration import Calibration
@@ -70,9 +71,23 @@ def test_groups_count_the_same_however_many_captures_they_have(overconfident, tm
     _, reports = calibrate(
         groups, overconfident, tmp_path / "a.safetensors", scans=2, half=True, progress=False
     )
-    assert [len(each.asked) for each in many] == [3 + 4] * 2  # twice round
-    assert len(one.asked) == 3 + 4 + 4 + 4  # four times, with four views where it should be more
+    assert sum(len(each.asked) for each in many) == len(one.asked) == 3 + 4 + 4 + 4  # of four photos each
+    assert min(len(each.asked) for each in many) >= 7
     assert reports.keys() == groups.keys()
+
+
+@pytest.mark.parametrize("captures", [1, 3, 4, 60])
+def test_numbers_of_views_take_turns_however_many_captures_there_are(captures):
+    posed = [Posed(f"capture {k}", 9, k).views for k in range(captures)]
+    drawn = list(itertools.islice(_scans(posed, 0), 24))
+    assert [len(order) for _, order in drawn] == list(VIEWS) * 6
+    names = [capture.name for capture, _ in drawn]
+    most, least = max(map(names.count, names)), min(map(names.count, names))
+    assert most - least <= 1
+    assert len({(capture.name, *order) for capture, order in drawn}) == 24
+    if captures > 24:
+        assert names != sorted(names)  # not those alone whose names come first
+        assert drawn[0][0].name != next(_scans(posed, 1))[0].name
 
 
 @pytest.mark.parametrize(

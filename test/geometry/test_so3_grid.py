@@ -51,6 +51,7 @@ def test_children_lie_around_their_parent(level: int) -> None:
     centred = so3.angle_between(so3.project(offspring.sum(1)), parents)
     assert centred.max() < 0.2 * so3_grid.cell_spacing(level)
     assert (so3_grid.children([5, 2]) // 8).tolist() == [5] * 8 + [2] * 8
+    assert so3_grid.children([[5, 2], [0, 1]])[1].tolist() == list(range(16))
 
 
 def test_cells_have_equal_volumes() -> None:

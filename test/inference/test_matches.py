@@ -11,6 +11,7 @@ import torch
 
 from relpose_ros.captures.folder import load_capture
 from relpose_ros.geometry import so3
+from relpose_ros.geometry.cameras import homogeneous
 from relpose_ros.inference import matches
 from relpose_ros.inference.local_features import LocalFeatures, find_features
 from relpose_ros.inference.matches import (
@@ -322,3 +323,15 @@ def test_the_same_bits_on_any_number_of_threads(textured):
         for a, b in zip(geometry.poses, three[pair].poses, strict=True):
             assert a.rotation.tobytes() == b.rotation.tobytes()
             assert a.covariance.tobytes() == b.covariance.tobytes()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_points_that_all_but_coincide_give_rotations_or_nothing(seed):
+    generator = np.random.default_rng(seed)
+    rays_i = homogeneous(0.1 + 1e-4 * generator.standard_normal((40, 2)))
+    rays_j = rays_i.copy()
+    rays_j[:, :2] += 1e-4 * generator.standard_normal((40, 2))
+    poses = matches._of_plane(rays_i, rays_j, 1e-3)
+    np.testing.assert_allclose(np.linalg.det(poses.rotations), 1, atol=1e-5)
+    square = poses.rotations @ poses.rotations.transpose(0, 2, 1)
+    np.testing.assert_allclose(square, np.broadcast_to(np.eye(3), square.shape), atol=1e-5)

@@ -10,7 +10,7 @@ from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.bundle_adjustment import refine
 from relpose_ros.inference.camera_positions import apart, joined
 from relpose_ros.inference.matches import NOTHING, RelativePose, TwoViewGeometry, match
-from relpose_ros.inference.refined_poses import settle
+from relpose_ros.inference.refined_poses import _informative, settle
 
 ANGLES = [0.0, 20.0, 40.0, 60.0]
 BEFORE = np.diag([0.1**2] * 3 + [math.radians(5) ** 2] * 3)
@@ -130,3 +130,10 @@ def test_matches_that_are_not_sure_leave_it_to_what_was_known_how_groups_go_toge
     joint = settle(unsure, before(4))[1]
     relative = joint[15:18, 15:18] + joint[21:24, 21:24] - joint[15:18, 21:24] - joint[21:24, 15:18]
     assert np.trace(relative) < 0.1 * np.trace(BEFORE[3:, 3:])
+
+
+def test_rounding_leaves_no_negative_information():
+    axes = so3.exp([0.3, -0.2, 0.9])
+    sound, unsound = (axes * [4.0, 1.0, least] @ axes.T for least in (0.0, -3.0))
+    np.testing.assert_allclose(_informative(unsound), sound, atol=1e-12)
+    np.testing.assert_allclose(_informative(sound), sound, atol=1e-12)

@@ -67,6 +67,8 @@ def test_shards_of_many_captures_go_on_where_they_were_cut_off(capture, tiny_pre
     assert {path.name for path in folder.iterdir()} == {"capture", "other"}
     assert len(open_scans([folder])) == 4
     np.testing.assert_array_equal(read_shard(folder / "capture")["images"], first["images"])
+    with pytest.raises(CaptureShardError, match=r"capture has 2 copies of 32 pixels, not 3 of 32"):
+        write_capture_shards(folder, [capture], tiny_preset, 3)
 
 
 def test_shards_that_cannot_be_made(capture, tiny_preset, tmp_path):
