@@ -109,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
         "--object-id",
         default="",
         metavar="ID",
-        help="of the object, for ObjectView (default: the folder's name)",
+        help="of the object, for ObjectView, which alone carries it (default: the folder's name)",
     )
     pack.add_argument(
         "--period", type=float, default=1.0, metavar="S", help="seconds between two photos (default: 1)"
@@ -129,7 +129,11 @@ def _parser() -> argparse.ArgumentParser:
         help="numbers of views (default: 2..8)",
     )
     evaluate.add_argument(
-        "--method", action="append", metavar="NAME", help="method to measure; again for more (default: all)"
+        "--method",
+        action="append",
+        metavar="NAME",
+        help="relpose, relpose-known, both, learned, geometry, constant-translation, identity or colmap; "
+        "again for more (default: all)",
     )
     evaluate.add_argument(
         "--variant",
@@ -157,7 +161,12 @@ def _parser() -> argparse.ArgumentParser:
         "Fit how far a network's probabilities hold on captures it was not trained on, and store it with the "
         "weights.",
     )
-    calibrate.add_argument("weights", type=_home_path, metavar="WEIGHTS", help="as of --weights elsewhere")
+    calibrate.add_argument(
+        "weights",
+        type=_home_path,
+        metavar="WEIGHTS",
+        help="network weights to calibrate: safetensors or a released checkpoint",
+    )
     _add_captures(calibrate)
     calibrate.add_argument(
         "--output", type=_home_path, required=True, metavar="FILE", help="safetensors file to write"

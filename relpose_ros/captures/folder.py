@@ -141,7 +141,11 @@ def load_capture(folder: Path) -> Capture:
     try:
         content = json.loads(listing.read_text(encoding="utf-8"))
     except FileNotFoundError as err:
-        text = f"{folder} holds no cameras.json, which lists a capture's images and boxes."
+        example = '{"file": "images/000.jpg", "width": 960, "height": 640, "box": [x0, y0, x1, y1]}'
+        text = (
+            f"{folder} holds no cameras.json, which lists a capture's images and boxes; at the least "
+            f'{{"images": [{example}, ...]}}.'
+        )
         raise CaptureError(text) from err
     except (OSError, ValueError) as err:
         text = f"{listing} cannot be read as JSON: {err}."
