@@ -754,7 +754,7 @@ def test_a_full_scan_is_not_told_to_take_one_more_view(
         send_views(scanner, bag_messages, stamp)
         told += [result.estimate.status for result in drain(scanner)]
     assert told[0] == "one more view: pair 0-1 knows hardly anything"
-    assert told[1] == f"no room for {told[0]}; {WITHOUT_ROOM[keep]}"
+    assert told[1] == f"not enough: pair 0-1 knows hardly anything; {WITHOUT_ROOM[keep]}"
 
 
 def send_pose(scanner: Scanner, messages: Any, stamp: float, x: float = 0.0, **fields: Any) -> Receipt:
