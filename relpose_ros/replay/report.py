@@ -141,7 +141,8 @@ def _facts(recording: Recording, last: EstimateRecord, comparison: Comparison | 
     count = len(recording.estimates)
     estimates = "estimate" if count == 1 else "estimates"
     facts = [
-        f"{len(recording.views)} views were used; the last of {count} {estimates} rests on {len(last.views)}."
+        f"{recording.arrivals()}; the last of {count} {estimates} rests on {len(last.views)}.",
+        *filter(None, [_sentence(recording.lost_enough())]),
     ]
     if comparison is not None:
         errors = np.array(list(comparison.rotation_errors.values()))

@@ -215,7 +215,12 @@ def test_statistics_tell_the_state_of_each_scan(messages: Any, circle_estimator:
     drain(scanner)
     after = scanner.statistics().scans["mug"]
     assert (after.views, after.estimates, after.latency_s) == (3, 1, 1.0)
-    assert (after.status, after.weakest_pair, after.dropped) == ("one more view", (1, 2), 0)
+    assert (after.status, after.weakest_pair, after.dropped, after.declined) == (
+        "one more view",
+        (1, 2),
+        0,
+        0,
+    )
     assert after.weakest_probability == pytest.approx(0.8)
     scanner.receive("image", "image", messages.rgb(pixels()))
     assert scanner.statistics().waiting == 1
