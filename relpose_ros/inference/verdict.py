@@ -30,16 +30,16 @@ CONTRADICTION = math.radians(10)
 LARGEST_DEVIATION = math.radians(12)
 """Largest standard deviation (worst axis) of a camera's rotation: within 15 degrees more often than not."""
 ONE_MORE = "one more view: "
+NOT_ENOUGH = "not enough: "
 WITHOUT_ROOM = {
-    "first": "drop_last_view makes room for another one, reset for all",
-    "latest": "the next one takes the place of the oldest",
-    "spread": "the next one from a new direction takes the place of the view that tells least",
+    "first": "the scan is full: drop_last_view makes room for another view, reset for all",
+    "latest": "take one more view: it takes the place of the oldest",
+    "spread": "take one more view from a new direction: it takes the place of the view that tells least",
 }
-"""What to do instead of one more view where no more are held, by the scan's policy of which ones stay."""
-
+"""What to do where no more views are held, by the scan's policy of which ones stay."""
 
 WITHOUT_PROBABILITIES = (
-    "one more view: this network regresses poses and cannot say how far to trust them, so that none of its "
+    f"{NOT_ENOUGH}this network regresses poses and cannot say how far to trust them, so that none of its "
     "estimates can be called enough"
 )
 """The verdict on poses that come without a distribution, in words."""
@@ -79,7 +79,7 @@ def judge(
                 f"enough: {len(trusted)} of {len(pairs)} pairs agree, rotations to about {worst:.0f} degrees",
             )
         reason = "these weights are not calibrated, so that none of their estimates can be called enough"
-        return Verdict.ONE_MORE_VIEW, weakest, f"not enough: {reason}"
+        return Verdict.ONE_MORE_VIEW, weakest, f"{NOT_ENOUGH}{reason}"
     loose = [camera for camera, is_tied in enumerate(tied) if not is_tied] or [int(deviations.argmax())]
     # Not the pair that knows least, which may be of two views that show opposite sides: the weak link of the
     # best chain is what a further view between the two would mend.
@@ -109,7 +109,7 @@ def without_room(words: str, keep: str) -> str:
         keep: Which views stay: a key of ``WITHOUT_ROOM``.
     """
     reason = words.removeprefix(ONE_MORE)
-    return words if reason == words else f"no room for one more view: {reason}; {WITHOUT_ROOM[keep]}"
+    return words if reason == words else f"{NOT_ENOUGH}{reason}; {WITHOUT_ROOM[keep]}"
 
 
 def _certainty(pair: PairRotation) -> float:

@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 import cv2
 import numpy as np
 
+from relpose_ros.estimates import Verdict
 from relpose_ros.views import Intrinsics, Scan
 
 if TYPE_CHECKING:
@@ -22,6 +23,12 @@ PICTURE_SIDE = 208
 """Pixels of a view's small picture: sharp at the size the report shows it, on a dense screen too."""
 PICTURE_MARGIN = 1.15
 """How much more than the box a picture shows: as much as the network sees (RelPose++ crops)."""
+
+WHY_DECLINED = {
+    "first": "came when the scan was full",
+    "spread": "came from no new direction, or right after such a picture",
+}
+"""What is told of the pictures that never had a place, by the policy of which views stay."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +66,10 @@ class Recording:
     estimates: list[EstimateRecord] = field(default_factory=list)
     newest_scan: Scan | None = None
     """The last estimate's scan, pixels and all."""
+    keep: str = "spread"
+    """Which views stay where more come than may be held, see ``ScanSettings``."""
+    declined: int = 0
+    """Pictures that never had a place."""
     # Weak, so that a recording of an hour does not hold an hour of images.
     _positions: WeakKeyDictionary[View, int] = field(default_factory=WeakKeyDictionary, repr=False)
 
@@ -72,6 +83,29 @@ class Recording:
         views = tuple(self._positions[view] for view in result.scan.views)
         scan = Scan(result.scan.object_id, tuple(self.views[k].view for k in views))
         self.estimates.append(EstimateRecord(log_time_ns, views, scan, result.estimate))
+
+    def arrivals(self) -> str:
+        """How many pictures came and what became of them, in words."""
+        held = len(self.views)
+        if not self.declined:
+            return f"{held} views were used"
+        came, why = held + self.declined, WHY_DECLINED[self.keep]
+        return f"{came} pictures came, {held} were held at some time, {self.declined} {why}"
+
+    def lost_enough(self) -> str:
+        """Which estimates said enough, in words, where the last one says so no more; else empty."""
+        said = [each.estimate.verdict == Verdict.ENOUGH for each in self.estimates]
+        if not any(said) or said[-1]:
+            return ""
+        runs: list[list[int]] = []
+        for number, enough in enumerate(said, start=1):
+            if enough and number > 1 and said[number - 2]:
+                runs[-1][1] = number
+            elif enough:
+                runs.append([number, number])
+        spans = ", ".join(f"{first}" if first == last else f"{first} to {last}" for first, last in runs)
+        noun = "estimate" if sum(said) == 1 else "estimates"
+        return f"{noun} {spans} of {len(said)} said enough, the last does not: a planner stops at the first"
 
 
 def _record(view: View) -> ViewRecord:

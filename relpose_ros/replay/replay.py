@@ -97,6 +97,7 @@ def replay(
             estimator = settings.load_estimator(weights)
         scanner = Scanner(estimator, settings)
         recordings: dict[str, Recording] = {}
+        forgotten: set[str] = set()
         rejections: Counter[str] = Counter()
         examples: dict[str, str] = {}
         total = sum(reader.counts[topic] for topic in inputs)
@@ -111,15 +112,20 @@ def replay(
                     examples.setdefault(reason, receipt.reason)
                 while scanner.pending():
                     for result in scanner.estimate_pending():
-                        if not result.estimate.cameras:  # takes back what a file keeps
-                            continue
                         object_id = result.scan.object_id
-                        recording = recordings.setdefault(object_id, Recording(object_id))
+                        if not result.estimate.cameras:  # takes back what a file keeps
+                            forgotten.add(object_id)
+                            continue
+                        recording = recordings.setdefault(object_id, Recording(object_id, keep=settings.keep))
                         recording.add(result, record.log_time_ns)
                         progress.set_postfix_str(result.estimate.status[:60], refresh=False)
                 progress.update()
+    statistics = scanner.statistics()
+    # The counts of a scan that made room for another object's are gone with it.
+    for object_id in recordings.keys() - forgotten:
+        recordings[object_id].declined = statistics.scans[object_id].declined
     for topic, entry in inputs.items():
-        counts = scanner.statistics().topics.get(topic)
+        counts = statistics.topics.get(topic)
         if entry.kind == "camera_pose" and counts is not None and not counts.used:
             text = (
                 "None of the %d camera poses on %s has the stamp of a view: they tell nothing of the scale."
@@ -148,6 +154,9 @@ def replay(
             *(len(recording.views), np.mean([each.estimate.seconds for each in recording.estimates])),
             last.status,
         )
+        told = [recording.arrivals() if recording.declined else "", recording.lost_enough()]
+        if any(told):
+            logger.info("Of %r: %s.", recording.object_id, "; ".join(filter(None, told)))
 
 
 def _cells(

@@ -17,7 +17,7 @@ import numpy as np
 
 from relpose_ros.estimates import Evidence, Verdict
 from relpose_ros.geometry import so3
-from relpose_ros.inference.verdict import rotation_deviations
+from relpose_ros.inference.verdict import NOT_ENOUGH, ONE_MORE, rotation_deviations
 from relpose_ros.replay.comparison import compare
 from relpose_ros.scanning.outgoing import is_weak, view_colour
 from relpose_ros.views import MAX_VIEWS
@@ -93,12 +93,13 @@ def write_report(
         "sampled": not cells,
         "rejected": [[reason, count] for reason, count in rejected],
     }
+    heading, verdict_class = _heading(last.estimate)
     texts = {
         "title": f"{recording.object_id} in {bag_name}",
-        "verdict": "Enough to act on" if last.estimate.verdict == Verdict.ENOUGH else "One more view needed",
-        "verdict_class": "enough" if last.estimate.verdict == Verdict.ENOUGH else "more",
+        "verdict": heading,
+        "verdict_class": verdict_class,
         # The verdict stands above it already.
-        "status": _sentence(re.sub("^(enough|one more view): ", "", last.estimate.status)),
+        "status": _sentence(re.sub(f"^(enough: |{NOT_ENOUGH}|{ONE_MORE})", "", last.estimate.status)),
         "facts": " ".join(_facts(recording, last, comparison)),
     }
     page = TEMPLATE.read_text(encoding="utf-8")
@@ -126,12 +127,22 @@ def yaw_pitch_roll(camera_j_from_camera_i: FloatArray) -> FloatArray:
     return np.asarray(np.degrees(np.stack([yaw, pitch, roll], -1)))
 
 
+def _heading(estimate: ScanEstimate) -> tuple[str, str]:
+    """The verdict in large letters, and the class that gives it colour and icon."""
+    if estimate.verdict == Verdict.ENOUGH:
+        return "Enough to act on", "enough"
+    if estimate.status.startswith(ONE_MORE):
+        return "One more view needed", "more"
+    return "Not enough yet", "short"
+
+
 def _facts(recording: Recording, last: EstimateRecord, comparison: Comparison | None) -> list[str]:
     """What a reader should know before looking at anything, as sentences."""
     count = len(recording.estimates)
     estimates = "estimate" if count == 1 else "estimates"
     facts = [
-        f"{len(recording.views)} views were used; the last of {count} {estimates} rests on {len(last.views)}."
+        f"{recording.arrivals()}; the last of {count} {estimates} rests on {len(last.views)}.",
+        *filter(None, [_sentence(recording.lost_enough())]),
     ]
     if comparison is not None:
         errors = np.array(list(comparison.rotation_errors.values()))

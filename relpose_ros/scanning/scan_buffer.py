@@ -66,6 +66,8 @@ class ScanBuffer:
         self.object_id = object_id
         self.dropped = 0
         """Views let go or declined by the keep policy, or forgotten after a jump of time."""
+        self.declined = 0
+        """Those among them that never had a place."""
         self._settings = settings
         self._backward_jump_ns = round(settings.backward_jump_s * 1e9)
         self._views: list[View] = []
@@ -191,10 +193,11 @@ class ScanBuffer:
         self._on_trial = None
         before = nearest_angles(viewing_directions(self._base)).min()
         after = nearest_angles(viewing_directions(estimate))[-1]
-        self.dropped += 1
         if not after > before + SPREAD_MARGIN:
+            self._decline()
             self._pause(work.newcomer.stamp_ns)
             return False
+        self.dropped += 1
         self._views, self._base = list(work.views), estimate
         self._pause_ns = self._paused_until_ns = 0
         return True
@@ -206,7 +209,7 @@ class ScanBuffer:
         self._failed = True
         if work.newcomer is not None:
             self._on_trial = None
-            self.dropped += 1
+            self._decline()
 
     def drop_last(self) -> View | None:
         """Forget the newest view and give it back; None where there is none."""
@@ -238,7 +241,7 @@ class ScanBuffer:
             self._candidates.append(view)
             if len(self._candidates) > self._settings.max_views:
                 self._candidates.popleft()
-                self.dropped += 1
+                self._decline()
             return Decision(True, "the scan is full: the next estimate tells whether it is worth a place")
         if full:
             del self._views[0]
@@ -249,11 +252,15 @@ class ScanBuffer:
 
     def _decline_further(self, stamp_ns: int, frame_id: str, topic: str) -> Decision:
         self._note_time(stamp_ns, frame_id, topic)
-        self.dropped += 1
+        self._decline()
         text = f"the scan of {self.object_id!r} has its {len(self._views)} views"
         if self._is_paused(stamp_ns):
             text += ", and one seen just before it gained nothing"
         return Decision(False, text)
+
+    def _decline(self) -> None:
+        self.dropped += 1
+        self.declined += 1
 
     def _note_time(self, stamp_ns: int, frame_id: str, topic: str) -> None:
         """Time goes on in this topic: whatever lay far behind was garbage."""
@@ -267,7 +274,7 @@ class ScanBuffer:
         self._paused_until_ns = stamp_ns + self._pause_ns
         while self._candidates and self._is_paused(self._candidates[0].stamp_ns):
             self._candidates.popleft()
-            self.dropped += 1
+            self._decline()
 
     def _is_paused(self, stamp_ns: int) -> bool:
         return self._settings.keep == "spread" and stamp_ns < self._paused_until_ns

@@ -102,6 +102,8 @@ class ScanStatistics:
     """Views i and j of the last estimate's least certain pair; None before the first."""
     weakest_probability: float | None
     """Probability that this pair is within 15 degrees of its strongest mode; None before the first."""
+    declined: int = 0
+    """Views, among those dropped, that the keep policy never gave a place."""
 
 
 @dataclass(frozen=True)
@@ -492,4 +494,5 @@ class _ScanState:
             status="" if self.estimate is None else self.estimate.status,
             weakest_pair=None if weakest is None else (weakest.i, weakest.j),
             weakest_probability=None if weakest is None else weakest.probability_within_15_deg,
+            declined=self.buffer.declined,
         )

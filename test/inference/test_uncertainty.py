@@ -200,14 +200,17 @@ def test_enough_needs_trusted_pairs_and_calibrated_ones(fisher_scene, cameras_ar
 @pytest.mark.parametrize(
     ("keep", "advice"),
     [
-        ("first", "drop_last_view makes room for another one, reset for all"),
-        ("latest", "the next one takes the place of the oldest"),
-        ("spread", "the next one from a new direction takes the place of the view that tells least"),
+        ("first", "the scan is full: drop_last_view makes room for another view, reset for all"),
+        ("latest", "take one more view: it takes the place of the oldest"),
+        (
+            "spread",
+            "take one more view from a new direction: it takes the place of the view that tells least",
+        ),
     ],
 )
 def test_a_full_scan_is_told_what_to_do_instead_of_one_more_view(keep, advice):
     words = without_room("one more view: pair 2-5 is ambiguous by about 180 degrees", keep)
-    assert words == f"no room for one more view: pair 2-5 is ambiguous by about 180 degrees; {advice}"
+    assert words == f"not enough: pair 2-5 is ambiguous by about 180 degrees; {advice}"
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from relpose_ros.estimates import ObjectPose
+from relpose_ros.estimates import ObjectPose, Verdict
 from relpose_ros.geometry import so3
 from relpose_ros.replay import bags
 from relpose_ros.replay.bags import BagError, BagReader
@@ -215,6 +215,74 @@ def test_views_that_make_way_are_numbered_once(
     assert [view["stamp_ns"] for view in scan["views"]] == [k * 10**9 for k in (1, 2, 3, 4, 5)]
     assert [each["views"] for each in scan["estimates"]] == [[0, 1], [0, 1, 2], [1, 2, 3], [2, 3, 4]]
     assert [camera["view"] for camera in scan["estimates"][-1]["cameras"]] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("keep", "told"),
+    [
+        ("first", "5 pictures came, 3 were held at some time, 2 came when the scan was full"),
+        ("latest", ""),
+        ("spread", "5 pictures came, 4 were held at some time, 1 came from no new direction"),
+    ],
+)
+def test_pictures_without_a_place_are_counted(
+    tmp_path: Path,
+    capture: Capture,
+    fake_estimator: Fake,
+    caplog: pytest.LogCaptureFixture,
+    keep: str,
+    told: str,
+) -> None:
+    folder, truth = capture
+    # The fourth camera looks as the second one does, the fifth stays where it is.
+    truth[3] = truth[1]
+    pack(folder, tmp_path / "bag")
+    settings = ScanSettings(max_views=3, keep=keep)
+    with caplog.at_level(logging.INFO, "relpose_ros"):
+        replay(tmp_path / "bag", tmp_path / "out", settings=settings, estimator=fake_estimator(truth))
+    page = (tmp_path / "out/report.html").read_text()
+    if told:
+        assert f"Of 'object': {told}" in caplog.text
+        assert told in page
+    else:
+        assert "pictures came" not in caplog.text
+        assert "5 views were used" in page
+
+
+def test_the_counts_of_a_scan_that_made_room_are_not_made_up(
+    tmp_path: Path, write_posed_capture: Callable[..., Any], fake_estimator: Fake, rewrite: Rewrite
+) -> None:
+    truth = write_posed_capture(tmp_path / "cup", 9)
+    pack(tmp_path / "cup", tmp_path / "one", form="object_view")
+
+    def rename(record: Record) -> Iterable[Record]:
+        record.message.object_id = "jar" if 4 <= record.log_time_ns // 10**9 <= 6 else "mug"
+        yield record
+
+    rewrite(tmp_path / "one", tmp_path / "bag", rename)
+    settings = ScanSettings(max_scans=1, max_views=2, keep="first")
+    replay(tmp_path / "bag", tmp_path / "out", settings=settings, estimator=fake_estimator(truth))
+    assert "4 views were used" in (tmp_path / "out/mug/report.html").read_text(), "of six, two declined"
+
+
+def test_an_enough_that_a_later_estimate_takes_back_is_told(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, truth = capture
+    inner = fake_estimator(truth)
+
+    class Doubting:
+        def estimate(self, scan: Any) -> Any:
+            estimate = inner.estimate(scan)
+            last = len(scan.views) == 5
+            return replace(estimate, verdict=Verdict.ONE_MORE_VIEW) if last else estimate
+
+    pack(folder, tmp_path / "bag")
+    with caplog.at_level(logging.INFO, "relpose_ros"):
+        replay(tmp_path / "bag", tmp_path / "out", estimator=Doubting())
+    told = "stimates 2 to 3 of 4 said enough, the last does not: a planner stops at the first."
+    assert f"Of 'object': e{told}" in caplog.text
+    assert f"E{told}" in (tmp_path / "out/report.html").read_text()
 
 
 def test_rejected_messages_are_counted_by_their_reason(

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from relpose_ros.estimates import Mode, PairRotation
+from relpose_ros.estimates import Mode, PairRotation, ScanEstimate, Verdict
 from relpose_ros.geometry import so3
 from relpose_ros.replay.pack import pack
 from relpose_ros.replay.recording import PICTURE_SIDE, Recording
@@ -72,6 +73,32 @@ def test_the_page_says_in_words_what_came_out(page: str) -> None:
     assert "of 10 relative rotations are right to 15°" in page
     assert "&lt;b&gt;mug &amp; cup in bag" in page
     assert "<b>mug" not in page
+
+
+@pytest.mark.parametrize(
+    ("max_views", "heading"),
+    [(8, '<div class="verdict more"'), (3, '<div class="verdict short"')],
+)
+def test_the_heading_asks_for_a_view_only_where_there_is_room(
+    tmp_path: Path, capture: Any, fake_estimator: Callable[..., Any], max_views: int, heading: str
+) -> None:
+    folder, truth = capture
+    inner = fake_estimator(truth)
+
+    class Doubting:
+        def estimate(self, scan: Scan) -> ScanEstimate:
+            words = "one more view: pair 0-1 says hardly anything"
+            return replace(inner.estimate(scan), verdict=Verdict.ONE_MORE_VIEW, status=words)
+
+    pack(folder, tmp_path / "bag")
+    settings = ScanSettings(max_views=max_views, keep="spread")
+    replay(tmp_path / "bag", tmp_path / "out", settings=settings, estimator=Doubting())
+    page = (tmp_path / "out/report.html").read_text()
+    assert heading in page
+    has_room = max_views > 5
+    assert ("One more view needed" in page, "Not enough yet" in page) == (has_room, not has_room)
+    advice = "; take one more view from a new direction: it takes the place of the view that tells least."
+    assert f"<p>Pair 0-1 says hardly anything{'.' if has_room else advice}</p>" in page
 
 
 def test_what_is_drawn_is_what_was_estimated(page: str) -> None:

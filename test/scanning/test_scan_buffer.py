@@ -57,13 +57,13 @@ def test_first_keeps_the_earliest() -> None:
     assert not decision.rejected
     assert decision.reason == "the scan of 'mug' has its 3 views"
     assert stamps_of(buffer) == [1, 2, 3]
-    assert buffer.dropped == 1
+    assert (buffer.dropped, buffer.declined) == (1, 1)
 
 
 def test_latest_keeps_the_newest() -> None:
     buffer = buffer_with(*range(1, 51), keep="latest", max_views=3)
     assert stamps_of(buffer) == [48, 49, 50]
-    assert buffer.dropped == 47
+    assert (buffer.dropped, buffer.declined) == (47, 0), "each had a place once"
 
 
 def test_spread_puts_a_newcomer_from_elsewhere_in_the_place_of_the_most_redundant(
@@ -78,6 +78,7 @@ def test_spread_puts_a_newcomer_from_elsewhere_in_the_place_of_the_most_redundan
     assert estimate_all(buffer, estimator) == [True]
     # 2 and 3 are closest; 2 is closer to 1 than 3 is to 4.
     assert stamps_of(buffer) == [1, 3, 4, 5]
+    assert (buffer.dropped, buffer.declined) == (1, 0), "2 had its place"
 
 
 def test_spread_undoes_a_swap_that_gains_nothing(circle_estimator: Callable[..., Any]) -> None:
@@ -92,7 +93,7 @@ def test_spread_undoes_a_swap_that_gains_nothing(circle_estimator: Callable[...,
     again = buffer.add(view(4), "copies")
     assert not again.accepted
     assert not again.rejected, "the same picture by another transport"
-    assert buffer.dropped == 1
+    assert (buffer.dropped, buffer.declined) == (1, 1)
 
 
 def test_spread_never_gives_up_the_first_view(circle_estimator: Callable[..., Any]) -> None:
@@ -166,11 +167,11 @@ def test_spread_takes_newcomers_in_turn_and_lets_the_oldest_go(circle_estimator:
     estimator = circle_estimator(lambda stamp: 3.0 * stamp)
     buffer = buffer_with(*range(50), keep="spread", max_views=4)
     assert stamps_of(buffer) == [0, 1, 2, 3]
-    assert buffer.dropped == 42, "four held, four in turn"
+    assert (buffer.dropped, buffer.declined) == (42, 42), "four held, four in turn"
     estimate_all(buffer, estimator)
     assert stamps_of(buffer)[0] == 0
     assert stamps_of(buffer)[-1] >= 46
-    assert buffer.dropped == 46
+    assert (buffer.dropped, buffer.declined) == (46, 44), "two of the four gained nothing"
 
 
 @pytest.mark.parametrize("keep", ["first", "latest", "spread"])
@@ -393,7 +394,7 @@ def test_a_trial_that_fails_leaves_the_views_as_they_are(circle_estimator: Calla
     buffer.give_up(work)
     assert not buffer.has_work()
     assert stamps_of(buffer) == [1, 2]
-    assert buffer.dropped == 1
+    assert (buffer.dropped, buffer.declined) == (1, 1)
     add(buffer, 10)
     assert estimate_all(buffer, circle_estimator()) == [True, True]
     assert stamps_of(buffer) == [1, 10]

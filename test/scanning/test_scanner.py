@@ -215,7 +215,12 @@ def test_statistics_tell_the_state_of_each_scan(messages: Any, circle_estimator:
     drain(scanner)
     after = scanner.statistics().scans["mug"]
     assert (after.views, after.estimates, after.latency_s) == (3, 1, 1.0)
-    assert (after.status, after.weakest_pair, after.dropped) == ("one more view", (1, 2), 0)
+    assert (after.status, after.weakest_pair, after.dropped, after.declined) == (
+        "one more view",
+        (1, 2),
+        0,
+        0,
+    )
     assert after.weakest_probability == pytest.approx(0.8)
     scanner.receive("image", "image", messages.rgb(pixels()))
     assert scanner.statistics().waiting == 1
@@ -754,7 +759,7 @@ def test_a_full_scan_is_not_told_to_take_one_more_view(
         send_views(scanner, bag_messages, stamp)
         told += [result.estimate.status for result in drain(scanner)]
     assert told[0] == "one more view: pair 0-1 knows hardly anything"
-    assert told[1] == f"no room for {told[0]}; {WITHOUT_ROOM[keep]}"
+    assert told[1] == f"not enough: pair 0-1 knows hardly anything; {WITHOUT_ROOM[keep]}"
 
 
 def send_pose(scanner: Scanner, messages: Any, stamp: float, x: float = 0.0, **fields: Any) -> Receipt:
