@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from relpose_ros.msg import ObjectView
 from sensor_msgs.msg import Image
 
 from relpose_ros.node.lifecycle_node import ScanNode
@@ -80,6 +81,7 @@ def test_an_override_of_the_reliability_stays(
     assert image.get_subscription_count() == 1
     assert asked_for(new_graph, IMAGE) == [BEST_EFFORT]
     assert asked_for(new_graph, CAMERA_INFO) == [RELIABLE]
+    assert len(node.told("from now on")) == 1, "the others are not made anew"
     assert new_graph.parameter("qos_overrides./image.subscription.reliability") == "best_effort"
     assert new_graph.parameter("qos_overrides./object_view.subscription.depth") == 7
     assert node.end() == 0
@@ -127,6 +129,9 @@ def test_camera_infos_without_images_are_told(
     new_graph.publish_until(
         lambda: node.told("WARN", "nobody publishes /image or /image/compressed"), "a warning", publish_info
     )
+    views = new_graph.publisher(ObjectView, OBJECT_VIEW, RELIABLE)
+    new_graph.wait_until(lambda: new_graph.diagnostic("advice") is None, "views that need no images")
+    assert new_graph.node.destroy_publisher(views)
     new_graph.publisher(Image, IMAGE, RELIABLE)
     node.wait_for("WARN", IMAGE, "most camera infos find no image", "reliable", "net.core.rmem_max")
     status = new_graph.diagnostics()
