@@ -47,11 +47,12 @@ from relpose_ros.node.reports import (
     Throttle,
     diagnostic_status,
     loss_advice,
+    missing_images_advice,
     pairing_advice,
     qos_advice,
     twin_advice,
 )
-from relpose_ros.scanning.scanner import Scanner
+from relpose_ros.scanning.scanner import UNPAIRED_AFTER_S, Scanner
 from relpose_ros.scanning.settings import SettingsError
 
 if TYPE_CHECKING:
@@ -68,8 +69,8 @@ BURST = 50
 """Messages that a subscription keeps while the callbacks are busy with others."""
 LOSS_REPEAT_AFTER_S = 60.0
 """Lost messages are told this often: a scan can do with some of a camera's frames."""
-UNPAIRED_AFTER_S = 2.0
-"""A camera info that is this late will not come."""
+ADAPT_PERIOD_S = 0.5
+"""How often the reliability that publishers offer is looked at."""
 
 INPUTS: tuple[tuple[Kind, str, Any, str], ...] = (
     ("object_view", "object_view", ObjectView, ""),
@@ -87,10 +88,10 @@ OUTPUTS: tuple[tuple[str, Any], ...] = (
     ("~/markers", MarkerArray),
 )
 
-IMAGE_QOS = QoSProfile(
+INPUT_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=BURST,
-    reliability=ReliabilityPolicy.BEST_EFFORT,  # matches every publisher
+    reliability=ReliabilityPolicy.RELIABLE,  # until a best effort publisher joins
     durability=DurabilityPolicy.VOLATILE,
 )
 RESULT_QOS = QoSProfile(
@@ -103,6 +104,10 @@ DIAGNOSTICS_TOPIC = "/diagnostics"
 DIAGNOSTICS_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10)
 OVERRIDABLE = QoSOverridingOptions(
     (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
+)
+# A read-only parameter could not tell a reliability that follows the publishers.
+OVERRIDABLE_BUT_RELIABILITY = QoSOverridingOptions(
+    [each for each in OVERRIDABLE.policy_kinds if each != QoSPolicyKind.RELIABILITY]
 )
 
 
@@ -167,6 +172,8 @@ class ScanNode(LifecycleNode):
         )
         self._health_timer: Any = None
         self._set_health_timer()
+        # Steady, so that it goes on while simulated time stands still.
+        self.create_timer(ADAPT_PERIOD_S, self._adapt_inputs, clock=Clock(clock_type=ClockType.STEADY_TIME))
         change_state = self._service_change_state
         change_state.callback = functools.partial(self._on_change_state, change_state.callback)
         self.add_on_set_parameters_callback(self._judge_parameters)
@@ -303,22 +310,65 @@ class ScanNode(LifecycleNode):
         for kind, name, message_type, transport in INPUTS:
             if transport and transport not in transports:
                 continue
-            topic = self.resolve_topic_name(name)
-            events = SubscriptionEventCallbacks(
-                incompatible_qos=functools.partial(self._on_incompatible_qos, topic, True),
-                matched=functools.partial(self._on_matched, topic),
-                message_lost=functools.partial(self._on_message_lost, topic),
-            )
-            self._publishers_of[topic] = 0
-            subscription = self.create_subscription(
-                message_type,
-                name,
-                functools.partial(self._on_message, scanner, kind, topic),
-                copy(IMAGE_QOS),
-                event_callbacks=events,
-                qos_overriding_options=OVERRIDABLE,
-            )
-            self._inputs.append(subscription)
+            callback = functools.partial(self._on_message, scanner, kind, self.resolve_topic_name(name))
+            self._inputs.append(self._subscribe(message_type, name, callback, INPUT_QOS.reliability))
+
+    def _subscribe(
+        self, message_type: Any, name: str, callback: Callable[[Any], None], reliability: ReliabilityPolicy
+    ) -> Any:
+        topic = self.resolve_topic_name(name)
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=functools.partial(self._on_incompatible_qos, topic, True),
+            matched=functools.partial(self._on_matched, topic),
+            message_lost=functools.partial(self._on_message_lost, topic),
+        )
+        self._publishers_of[topic] = 0
+        qos = copy(INPUT_QOS)  # rclpy writes the overrides into the profile
+        qos.reliability = reliability
+        return self.create_subscription(
+            message_type,
+            name,
+            callback,
+            qos,
+            event_callbacks=events,
+            qos_overriding_options=OVERRIDABLE_BUT_RELIABILITY if self._adapts(topic) else OVERRIDABLE,
+        )
+
+    def _adapts(self, topic: str) -> bool:
+        """Whether the subscription's reliability follows the publishers: an override stays as it is."""
+        return f"qos_overrides.{topic}.subscription.reliability" not in self._parameter_overrides
+
+    def _adapt_inputs(self) -> None:
+        """Ask for reliable delivery where every publisher offers it, and for best effort elsewhere."""
+        # A transition may take long, and makes or releases the inputs itself.
+        if not self.in_transition.acquire(blocking=False):
+            return
+        try:
+            for k, subscription in enumerate(self._inputs):
+                topic = subscription.topic_name
+                if self._closing or not self._adapts(topic):
+                    continue
+                offered = {each.qos_profile.reliability for each in self.get_publishers_info_by_topic(topic)}
+                best_effort = ReliabilityPolicy.BEST_EFFORT in offered
+                wanted = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+                if wanted != subscription.qos_profile.reliability:
+                    self._inputs[k] = self._subscribe_anew(subscription, wanted)
+                    why = "a publisher is" if best_effort else "every publisher is"
+                    now = wanted.name.lower().replace("_", " ")
+                    self.get_logger().info(f"{topic} is subscribed {now} from now on, as {why}.")
+        finally:
+            self.in_transition.release()
+
+    def _subscribe_anew(self, old: Any, reliability: ReliabilityPolicy) -> Any:
+        """The subscription that takes the place of ``old``, once what has come there is taken."""
+        with old.handle:
+            take = functools.partial(old.handle.take_message, old.msg_type, old.raw)
+            waiting = list(iter(take, None))
+        self.destroy_subscription(old)
+        subscription = self._subscribe(old.msg_type, old.topic, old.callback, reliability)
+        for message, _ in waiting:
+            old.callback(message)
+        return subscription
 
     def _release(self) -> None:
         self._active = False
@@ -367,7 +417,10 @@ class ScanNode(LifecycleNode):
                 self._ask_for_estimate()
 
     def _on_incompatible_qos(self, topic: str, subscribing: bool, event: Any) -> None:
-        advice = qos_advice(topic, QoSPolicyKind(event.last_policy_kind), subscribing=subscribing)
+        policy = QoSPolicyKind(event.last_policy_kind)
+        if subscribing and policy == QoSPolicyKind.RELIABILITY and self._adapts(topic):
+            return
+        advice = qos_advice(topic, policy, subscribing=subscribing)
         self._incompatible[topic] = (subscribing, advice)
         self.get_logger().warning(advice)
 
@@ -375,9 +428,10 @@ class ScanNode(LifecycleNode):
         self._publishers_of[topic] = event.current_count
 
     def _on_message_lost(self, topic: str, event: Any) -> None:
-        self._lost[topic] = event.total_count
+        # The event's total begins anew with a subscription.
+        self._lost[topic] = self._lost.get(topic, 0) + event.total_count_change
         if self._active:
-            line = self._loss_throttle.pass_on(topic, loss_advice(topic, event.total_count))
+            line = self._loss_throttle.pass_on(topic, loss_advice(topic, self._lost[topic]))
             if line is not None:
                 self.get_logger().warning(line)
 
@@ -558,7 +612,18 @@ class ScanNode(LifecycleNode):
             advice.append(twin_advice(estimates))
         if statistics is not None and (statistics.unpaired_s or 0.0) > UNPAIRED_AFTER_S:
             advice.append(pairing_advice(infos, self._publishers_of.get(infos, 0)))
+        elif statistics is not None and statistics.images_missing:
+            advice += self._advice_on_missing_images()
         return advice
+
+    def _advice_on_missing_images(self) -> list[str]:
+        topics = {kind: self.resolve_topic_name(name) for kind, name, _, _ in INPUTS}
+        images = [topics[each] for each in ("image", "compressed") if topics[each] in self._publishers_of]
+        publishers = {topic: self._publishers_of[topic] for topic in images}
+        # Views that bring their own camera matrix leave a camera's infos without a use.
+        if not any(publishers.values()) and self._publishers_of.get(topics["object_view"]):
+            return []
+        return [missing_images_advice(publishers)]
 
     def _publish_diagnostics(self, statistics: Statistics | None) -> None:
         health = NodeHealth(

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from relpose_ros.scanning.scanner import Statistics
 
+AGAINST_LOSS = "Make the publishers reliable, raise net.core.rmem_max, or send compressed images."
 REPEAT_AFTER_S = 5.0
 """A rejection like one that was just logged is counted, and told again after this long."""
 
@@ -95,11 +96,7 @@ def qos_advice(topic: str, kind: QoSPolicyKind, *, subscribing: bool) -> str:
 
 def loss_advice(topic: str, lost: int) -> str:
     """What to do about messages that were sent and never came, which best effort allows."""
-    parameter = f"qos_overrides.{topic}.subscription.reliability"
-    return (
-        f"{topic}: messages are lost on the way, {lost} so far. Where the publisher is reliable, set this "
-        f"node's parameter {parameter} to reliable; compressed images are lost less easily."
-    )
+    return f"{topic}: messages are lost on the way, {lost} so far. {AGAINST_LOSS}"
 
 
 def pairing_advice(topic: str, publishers: int) -> str:
@@ -112,6 +109,20 @@ def pairing_advice(topic: str, publishers: int) -> str:
     if publishers == 0:
         return f"Images come in, but nobody publishes {topic}: remap camera_info, or send ObjectView."
     return f"Images come in, but no message on {topic} has the stamp of one: give both the same header.stamp."
+
+
+def missing_images_advice(publishers: Mapping[str, int]) -> str:
+    """What to do about camera infos of which no view comes, because most find no image of their stamp.
+
+    Args:
+        publishers: How many nodes publish each topic of images, by its name on the graph, remapped.
+    """
+    published = [topic for topic, count in publishers.items() if count]
+    if not published:
+        topics = " or ".join(publishers)
+        return f"Camera infos come in, but nobody publishes {topics}: remap it, or send ObjectView."
+    topics = " and ".join(published)
+    return f"{topics}: most camera infos find no image, so images get lost on the way. {AGAINST_LOSS}"
 
 
 def twin_advice(topic: str) -> str:
@@ -191,6 +202,7 @@ def _statistics_values(statistics: Statistics) -> Iterator[tuple[str, str]]:
             i, j = scan.weakest_pair
             yield f"{object_id} weakest pair", f"{i}-{j} ({scan.weakest_probability:.2f} within 15 degrees)"
     yield "waiting for a counterpart", str(statistics.waiting)
+    yield "camera infos without an image", str(statistics.infos_alone)
     yield "failed estimates", str(statistics.failed)
     if statistics.last_failure:
         yield "last failure", statistics.last_failure

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, get_args
 
@@ -38,6 +39,9 @@ if TYPE_CHECKING:
     from relpose_ros.views import View
 
 _logger = logging.getLogger("relpose_ros")
+
+UNPAIRED_AFTER_S = 2.0
+"""An image or a camera info whose counterpart is this late will find none."""
 
 
 class SupportsEstimate(Protocol):
@@ -117,6 +121,10 @@ class Statistics:
     """Images that wait for a camera info of their stamp."""
     unpaired_s: float | None
     """Seconds since the first image that found none, if no other image has found one since; else None."""
+    infos_alone: int
+    """Camera infos that found no image in time."""
+    images_missing: bool
+    """Whether most of the latest camera infos found none."""
     failed: int
     """Estimates that ended in an error."""
     last_failure: str
@@ -139,7 +147,7 @@ class Scanner:
         Args:
             estimator: Makes the estimates.
             settings: Which views to hold, and how long.
-            clock: Seconds, for latencies alone.
+            clock: Seconds, for latencies and for how long messages wait.
         """
         self._estimator = estimator
         self._settings = settings
@@ -155,6 +163,7 @@ class Scanner:
         self._topics: dict[str, _TopicState] = {}
         self._taken_back: list[Result] = []
         self._unpaired_since: float | None = None
+        self._infos = _InfoRecord()
         self._failed = 0
         self._last_failure = ""
 
@@ -229,6 +238,7 @@ class Scanner:
         """
         with self._receiving, self._state:
             self._pairing.clear()
+            self._infos.clear()
             self._unpaired_since = None
             chosen = [each for each in self._scans if object_id in {None, each}]
             forgotten = 0
@@ -283,6 +293,8 @@ class Scanner:
         with self._receiving:
             waiting = self._pairing.waiting()
             since = self._unpaired_since
+            self._infos.settle(self._clock())
+            infos_alone, images_missing = self._infos.alone, self._infos.most_are_alone()
         with self._state:
             return Statistics(
                 topics={
@@ -292,6 +304,8 @@ class Scanner:
                 scans={object_id: state.snapshot() for object_id, state in self._scans.items()},
                 waiting=waiting,
                 unpaired_s=None if since is None else self._clock() - since,
+                infos_alone=infos_alone,
+                images_missing=images_missing,
                 failed=self._failed,
                 last_failure=self._last_failure,
             )
@@ -329,9 +343,12 @@ class Scanner:
 
     def _receive_half(self, kind: Kind, topic: str, message: Any, camera: str) -> Receipt:
         source = source_of(message, topic)
-        receipts = [
-            self._offer_pair(pair) for pair in self._pairing.add(kind, Arrival(message, source), camera)
-        ]
+        pairs = self._pairing.add(kind, Arrival(message, source), camera)
+        if kind == "camera_info":
+            self._infos.came(camera, source.stamp_ns, self._clock())
+        if pairs:
+            self._infos.found_image(camera, source.stamp_ns)
+        receipts = [self._offer_pair(pair) for pair in pairs]
         if not receipts:
             if kind != "camera_info" and self._unpaired_since is None:
                 self._unpaired_since = self._clock()
@@ -464,6 +481,45 @@ class Scanner:
     def _move_taken_back(self, results: list[Result]) -> None:
         results += self._taken_back
         self._taken_back.clear()
+
+
+class _InfoRecord:
+    """Which camera infos find an image, and which have waited too long for one."""
+
+    def __init__(self) -> None:
+        self.alone = 0
+        self._waiting: dict[tuple[str, int], float] = {}
+        self._found: set[tuple[str, int]] = set()
+        self._latest: deque[bool] = deque(maxlen=10)
+
+    def came(self, camera: str, stamp_ns: int, now: float) -> None:
+        self.settle(now)
+        self._waiting.setdefault((camera, stamp_ns), now)
+
+    def found_image(self, camera: str, stamp_ns: int) -> None:
+        if (camera, stamp_ns) in self._waiting:
+            self._found.add((camera, stamp_ns))
+
+    def settle(self, now: float) -> None:
+        """Judge those that came long ago, in their order: how many images get lost is what counts."""
+        while self._waiting:
+            oldest = next(iter(self._waiting))
+            if now - self._waiting[oldest] <= UNPAIRED_AFTER_S:
+                return
+            del self._waiting[oldest]
+            self._latest.append(oldest in self._found)
+            self.alone += oldest not in self._found
+            self._found.discard(oldest)
+
+    def most_are_alone(self) -> bool:
+        """Whether most of the latest found no image. Two say nothing: a camera may just have begun."""
+        return len(self._latest) > 2 and 2 * sum(self._latest) < len(self._latest)
+
+    def clear(self) -> None:
+        """Forget all but the count."""
+        self._waiting.clear()
+        self._found.clear()
+        self._latest.clear()
 
 
 @dataclass

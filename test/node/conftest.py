@@ -44,10 +44,6 @@ PATIENCE_S = 120.0
 """How long something may take before a test gives up: generous, since other work may load the machine. A node
 that starts in two seconds takes ten times as long beside eleven others, and longer yet from a cold disk."""
 
-NONE_LOST = "qos_overrides./object_view.subscription.reliability:=reliable"
-"""Best effort, the node's own, may lose a message where the machine has more to do: what these tests count
-on coming through comes on this topic."""
-
 LATCHED = QoSProfile(
     depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
@@ -422,7 +418,7 @@ def start_without_network(start: Callable[..., NodeProcess]) -> Callable[..., No
     def start_without_network(
         *parameters: str, loading_s: float = 0.0, estimating_s: float = 0.0, files: Sequence[Path] = ()
     ) -> NodeProcess:
-        given = [word for each in (NONE_LOST, *parameters) for word in ("-p", each)]
+        given = [word for each in parameters for word in ("-p", each)]
         given += [word for each in files for word in ("--params-file", str(each))]
         times = (str(loading_s), str(estimating_s))
         return start(*times, "--ros-args", *given, program=START_WITHOUT_NETWORK)
@@ -433,7 +429,7 @@ def start_without_network(start: Callable[..., NodeProcess]) -> Callable[..., No
 @pytest.fixture(scope="module")
 def running(domain: int, weights: Path) -> Iterator[NodeProcess]:
     """One node for a whole module: most of its start is PyTorch's."""
-    parameters = (f"weights:={weights}", "threads:=1", "diagnostics_period_s:=0.1", NONE_LOST)
+    parameters = (f"weights:={weights}", "threads:=1", "diagnostics_period_s:=0.1")
     with node_processes() as start:
         node = start("--ros-args", *(word for each in parameters for word in ("-p", each)))
         node.wait_for("Waiting for views")

@@ -95,6 +95,8 @@ def test_diagnostics_tell_the_worst_first() -> None:
         scans={"mug": ScanStatistics(4, 3, 1, 0.25, "enough", (1, 2), 0.875)},
         waiting=3,
         unpaired_s=None,
+        infos_alone=7,
+        images_missing=False,
         failed=0,
         last_failure="",
     )
@@ -108,6 +110,7 @@ def test_diagnostics_tell_the_worst_first() -> None:
     assert values["/image last rejection"] == "the width is 0"
     assert values["mug weakest pair"] == "1-2 (0.88 within 15 degrees)"
     assert values["mug latency s"] == "0.250"
+    assert values["camera infos without an image"] == "7"
 
     failed = replace(statistics, failed=1, last_failure="no memory is left")
     bad = diagnostic_status("/scan_node", replace(healthy, failing=True), failed)

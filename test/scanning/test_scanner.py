@@ -255,6 +255,38 @@ def test_images_that_find_no_camera_info_are_noticed(
     assert scanner.statistics().unpaired_s is None
 
 
+def test_camera_infos_whose_images_are_lost_are_counted(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    now = [0.0]
+    scanner = Scanner(circle_estimator(), ScanSettings(), clock=lambda: now[0])
+
+    def send(stamps: range, lost: Callable[[int], bool]) -> None:
+        for stamp in stamps:
+            info = bag_messages.camera_info(40, 32, (4, 4, 20, 20), stamp=stamp)
+            scanner.receive("camera_info", "info", info)
+            if not lost(stamp):
+                scanner.receive("image", "image", bag_messages.rgb(pixels(), stamp=stamp))
+            now[0] += 1.0
+
+    def told() -> tuple[int, bool]:
+        statistics = scanner.statistics()
+        return statistics.infos_alone, statistics.images_missing
+
+    send(range(1, 4), lambda _: True)
+    assert told() == (1, False), "two of the three may still find theirs"
+    send(range(4, 6), lambda _: True)
+    assert told() == (3, True)
+    send(range(6, 16), lambda stamp: stamp % 4 == 0)
+    now[0] += 3.0
+    assert told() == (7, False), "most images come"
+    send(range(16, 26), lambda stamp: stamp % 4 != 0)
+    now[0] += 3.0
+    assert told() == (14, True)
+    scanner.reset("for a test")
+    assert told() == (14, False)
+
+
 def test_other_evidence_has_every_scan_estimated_again(
     bag_messages: Any, circle_estimator: Callable[..., Any]
 ) -> None:
