@@ -81,6 +81,7 @@ def test_an_override_of_the_reliability_stays(
     assert image.get_subscription_count() == 1
     assert asked_for(new_graph, IMAGE) == [BEST_EFFORT]
     assert asked_for(new_graph, CAMERA_INFO) == [RELIABLE]
+    assert node.wait_for("from now on")  # the line comes after the subscription
     assert len(node.told("from now on")) == 1, "the others are not made anew"
     assert new_graph.parameter("qos_overrides./image.subscription.reliability") == "best_effort"
     assert new_graph.parameter("qos_overrides./object_view.subscription.depth") == 7
