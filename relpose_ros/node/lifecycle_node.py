@@ -69,7 +69,7 @@ BURST = 50
 """Messages that a subscription keeps while the callbacks are busy with others."""
 LOSS_REPEAT_AFTER_S = 60.0
 """Lost messages are told this often: a scan can do with some of a camera's frames."""
-ADAPT_PERIOD_S = 0.5
+ADAPT_PERIOD_S = 0.2
 """How often the reliability that publishers offer is looked at."""
 
 INPUTS: tuple[tuple[Kind, str, Any, str], ...] = (
