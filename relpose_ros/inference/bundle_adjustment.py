@@ -4,7 +4,7 @@ It may only improve: `refine` answers with poses that reproject the same points 
 
 The least squares are our own, since no solver of SciPy's knows that a point ties no other point: on scans of
 photographs the sparse steps of `least_squares` (LSMR) took four times as long and stopped short in some of
-the long valleys of narrow views; its dense steps took more than a hundred times as long.
+the long valleys of narrow views; its dense steps were given up on unfinished.
 """
 
 from __future__ import annotations
