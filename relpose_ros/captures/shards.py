@@ -27,6 +27,7 @@ import multiprocessing
 import shutil
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -39,11 +40,13 @@ from relpose_ros.captures.scans import PLACE_STRIDE, RenderedScan, ScanRenderer
 from relpose_ros.captures.scenes import Motion, ScanStyle
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     import numpy.typing as npt
 
 
+_UNFINISHED = ".unfinished"
 _LOG = logging.getLogger(__name__)
 _MAX_FRUITLESS = 3
 """So many times in a row all processes may die before a shard is whole."""
@@ -119,6 +122,25 @@ def _write_some(
     return done
 
 
+@contextmanager
+def new_shard(folder: Path) -> Iterator[dict[str, npt.NDArray[Any]]]:
+    """Arrays to fill, by their names, which stand in their place as a shard when all are whole."""
+    unfinished = folder.with_name(folder.name + _UNFINISHED)
+    shutil.rmtree(unfinished, ignore_errors=True)  # of a run that was cut off
+    unfinished.mkdir(parents=True)
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    yield arrays
+    for name, array in arrays.items():
+        np.save(unfinished / f"{name}.npy", array)
+    unfinished.rename(folder)
+
+
+def shard_folders(folders: Iterable[Path]) -> list[Path]:
+    """The shards under some folders that are whole, in order of their names."""
+    found = {path.parent for folder in folders for path in folder.rglob("camera_from_object.npy")}
+    return sorted(path for path in found if path.suffix != _UNFINISHED)
+
+
 def read_shard(folder: Path) -> dict[str, npt.NDArray[Any]]:
     """The arrays of one shard by name, memory-mapped."""
     return {path.stem: np.load(path, mmap_mode="r") for path in sorted(folder.glob("*.npy"))}
@@ -134,31 +156,26 @@ def _write_shard(folder: Path, plan: ShardPlan, number: int) -> None:
         _renderers[plan] = ScanRenderer(plan.seed, plan.image_size, assets=assets, style=plan.style)
     renderer = _renderers[plan]
     m, n, s, cells = plan.scans, plan.views, plan.image_size, plan.image_size // PLACE_STRIDE
-    unfinished = folder / f"{number:05d}.unfinished"
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir()
-    arrays: dict[str, npt.NDArray[Any]] = {
-        "images": np.empty((m, n, s, s, 3), np.uint8),
-        "places": np.empty((m, n, cells, cells, 3), np.float16),
-        "masks": np.empty((m, n, s, s // 8), np.uint8),
-        "crop_parameters": np.empty((m, n, 3), np.float32),
-        "camera_from_object": np.empty((m, n, 3, 4), np.float32),
-        "intrinsics": np.empty((m, n, 4), np.float32),
-        "crops": np.empty((m, n, 3), np.float32),
-        "image_sizes": np.empty((m, n, 2), np.int32),
-        "complete": np.empty((m, n), np.bool_),
-        "symmetry": np.empty((m, 5), np.float32),
-        "motion": np.empty(m, np.uint8),
-        "names": np.empty(m, "U64"),
-    }
-    for row in range(m):
-        _fill(arrays, row, renderer.scan(number * m + row, n))
-    for name, array in arrays.items():
-        np.save(unfinished / f"{name}.npy", array)
-    unfinished.rename(folder / f"{number:05d}")
+    with new_shard(folder / f"{number:05d}") as arrays:
+        arrays.update(
+            images=np.empty((m, n, s, s, 3), np.uint8),
+            places=np.empty((m, n, cells, cells, 3), np.float16),
+            masks=np.empty((m, n, s, s // 8), np.uint8),
+            crop_parameters=np.empty((m, n, 3), np.float32),
+            camera_from_object=np.empty((m, n, 3, 4), np.float32),
+            intrinsics=np.empty((m, n, 4), np.float32),
+            crops=np.empty((m, n, 3), np.float32),
+            image_sizes=np.empty((m, n, 2), np.int32),
+            complete=np.empty((m, n), np.bool_),
+            symmetry=np.empty((m, 5), np.float32),
+            motion=np.empty(m, np.uint8),
+            names=np.empty(m, "U64"),
+        )
+        for row in range(m):
+            _fill(arrays, row, renderer.scan(number * m + row, n))
 
 
-def _fill(arrays: dict[str, npt.NDArray[Any]], row: int, scan: RenderedScan) -> None:
+def _fill(arrays: Mapping[str, npt.NDArray[Any]], row: int, scan: RenderedScan) -> None:
     for name in (
         "images",
         "places",

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from relpose_ros.captures.shards import read_shard
+from relpose_ros.captures.shards import read_shard, shard_folders
 from relpose_ros.errors import RelPoseError
 from relpose_ros.network.crops import IMAGE_MEAN, IMAGE_STD
 from relpose_ros.training.objective import Batch
@@ -84,9 +84,7 @@ def open_scans(folders: Iterable[Path]) -> Scans:
     Raises:
         ShardError: as `Scans`.
     """
-    found = sorted({path.parent for folder in folders for path in folder.rglob("images.npy")})
-    # A shard being written has another name until it is whole.
-    return Scans([read_shard(path) for path in found if path.suffix != ".unfinished"])
+    return Scans([read_shard(path) for path in shard_folders(folders)])
 
 
 @dataclass(frozen=True)

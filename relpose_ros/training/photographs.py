@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import zlib
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from relpose_ros.captures.scans import PLACE_STRIDE
-from relpose_ros.captures.shards import read_shard
+from relpose_ros.captures.shards import new_shard, read_shard
 from relpose_ros.errors import RelPoseError
 from relpose_ros.network.crops import IMAGE_MEAN, IMAGE_STD, crop_view
 
@@ -85,21 +84,6 @@ def capture_shard(
     }
 
 
-def write_capture_shard(folder: Path, shard: dict[str, npt.NDArray[Any]]) -> None:
-    """Write a shard where `relpose_ros.captures.shards.read_shard` finds it.
-
-    Args:
-        folder: Of this shard, made here.
-        shard: From `capture_shard`.
-    """
-    partial = folder.with_name(folder.name + ".unfinished")
-    shutil.rmtree(partial, ignore_errors=True)  # of a run that was cut off
-    partial.mkdir(parents=True)
-    for name, array in shard.items():
-        np.save(partial / f"{name}.npy", array)
-    partial.rename(folder)
-
-
 def write_capture_shards(
     folder: Path,
     captures: Iterable[Capture],
@@ -139,8 +123,8 @@ def write_capture_shards(
             _check_alike(folder / capture.name, preset, copies)
             continue
         own_seed = zlib.crc32(f"{seed} {capture.name}".encode())
-        shard = capture_shard(capture, preset, copies, masked_copies=masked_copies, seed=own_seed)
-        write_capture_shard(folder / capture.name, shard)
+        with new_shard(folder / capture.name) as arrays:
+            arrays |= capture_shard(capture, preset, copies, masked_copies=masked_copies, seed=own_seed)
     return len(written)
 
 

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from relpose_ros.captures.folder import Frame, save_capture
-from relpose_ros.captures.shards import read_shard
+from relpose_ros.captures.shards import new_shard, read_shard
 from relpose_ros.geometry import so3
 from relpose_ros.training.batches import FIELDS, Scans, open_scans
 from relpose_ros.training.photographs import (
     CaptureShardError,
     capture_shard,
-    write_capture_shard,
     write_capture_shards,
 )
 from relpose_ros.views import BoundingBox, View
@@ -44,7 +43,8 @@ def test_crops_show_the_box_with_jitter_and_poses_stay(capture, tiny_preset, tmp
     assert len(np.unique(shard["crop_parameters"][:, 0, :2], axis=0)) > 1
     again = capture_shard(capture, tiny_preset, 4, masked_copies=1, seed=1)
     np.testing.assert_array_equal(again["images"], shard["images"])
-    write_capture_shard(tmp_path / "shards" / "00000", shard)
+    with new_shard(tmp_path / "shards" / "00000") as arrays:
+        arrays |= shard
     scans = Scans([read_shard(tmp_path / "shards" / "00000")])
     assert len(scans) == 4
     assert set(scans.row(3)) == set(FIELDS)
