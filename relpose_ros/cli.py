@@ -242,6 +242,25 @@ def _parser() -> argparse.ArgumentParser:
     _add_split(shard, "train")
     shard.add_argument("--seed", type=int, default=0, help="of the jitter (default: 0)")
 
+    features = command(
+        "features",
+        _features,
+        "Keep what the frozen backbone of 'compact' sees in shards, so that it is trained many times sooner.",
+    )
+    features.add_argument("shards", type=Path, nargs="+", metavar="SHARDS", help="folders of shards of crops")
+    features.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to write into")
+    features.add_argument(
+        "--copies",
+        type=int,
+        default=1,
+        metavar="K",
+        help="how often each scan is looked at, changed at random (default: 1)",
+    )
+    features.add_argument(
+        "--plain", action="store_true", help="look at the scans as they are, for instance to measure on"
+    )
+    features.add_argument("--seed", type=int, default=0, help="of the changes (default: 0)")
+
     train = command(
         "train", _train, "Train a network on rendered shards, or go on with a run that was stopped."
     )
@@ -519,6 +538,22 @@ def _shard(arguments: argparse.Namespace) -> int:
         PRESETS[arguments.preset],
         arguments.copies,
         masked_copies=arguments.masked_copies,
+        seed=arguments.seed,
+    )
+    return 0
+
+
+def _features(arguments: argparse.Namespace) -> int:
+    from relpose_ros.training.batches import Augmentation
+    from relpose_ros.training.feature_shards import write_feature_shards
+    from relpose_ros.training.trainer import initial_network, settings_for
+
+    write_feature_shards(
+        arguments.output,
+        arguments.shards,
+        initial_network(settings_for("compact")).eval(),
+        arguments.copies,
+        augmentation=None if arguments.plain else Augmentation(),
         seed=arguments.seed,
     )
     return 0

@@ -1,7 +1,6 @@
 """Anti-aliased residual network with group norm (R. Zhang, ICML 2019; He et al. 2016).
 
-Where a preset blurs, resolution is halved by a blur beside convolutions of stride 1; else by their stride,
-because the depthwise gradient of the blurs would take half of a training step on a CPU.
+Resolution is halved by a blur beside convolutions of stride 1.
 Module and attribute names are those of the released checkpoints.
 """
 
@@ -39,16 +38,15 @@ class Blur(nn.Module):
         return functional.conv2d(padded, self.filt, stride=2, groups=len(self.filt))
 
 
-def _convolution(inside: int, outside: int, size: int, stride: int = 1) -> nn.Conv2d:
-    return nn.Conv2d(inside, outside, size, stride=stride, padding=size // 2, bias=False)
+def _convolution(inside: int, outside: int, size: int) -> nn.Conv2d:
+    return nn.Conv2d(inside, outside, size, padding=size // 2, bias=False)
 
 
-def _shortcut(inside: int, outside: int, *, halve: bool, blurs: bool) -> nn.Sequential | None:
+def _shortcut(inside: int, outside: int, *, halve: bool) -> nn.Sequential | None:
     if not halve and inside == outside:
         return None
-    blur = [Blur(inside)] if halve and blurs else []
-    stride = 2 if halve and not blurs else 1
-    return nn.Sequential(*blur, _convolution(inside, outside, 1, stride), group_norm(outside))
+    blur = [Blur(inside)] if halve else []
+    return nn.Sequential(*blur, _convolution(inside, outside, 1), group_norm(outside))
 
 
 class Bottleneck(nn.Module):
@@ -56,17 +54,17 @@ class Bottleneck(nn.Module):
 
     expansion = 4
 
-    def __init__(self, inside: int, width: int, *, halve: bool, blurs: bool) -> None:
+    def __init__(self, inside: int, width: int, *, halve: bool) -> None:
         super().__init__()
         outside = width * self.expansion
         last = _convolution(width, outside, 1)
         self.conv1 = _convolution(inside, width, 1)
         self.bn1 = group_norm(width)
-        self.conv2 = _convolution(width, width, 3, stride=2 if halve and not blurs else 1)
+        self.conv2 = _convolution(width, width, 3)
         self.bn2 = group_norm(width)
-        self.conv3 = nn.Sequential(Blur(width), last) if halve and blurs else last
+        self.conv3 = nn.Sequential(Blur(width), last) if halve else last
         self.bn3 = group_norm(outside)
-        self.downsample = _shortcut(inside, outside, halve=halve, blurs=blurs)
+        self.downsample = _shortcut(inside, outside, halve=halve)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(B, inside, h, w) -> (B, outside, h, w), or half of h and w."""
@@ -76,49 +74,21 @@ class Bottleneck(nn.Module):
         return functional.relu(residual + (x if self.downsample is None else self.downsample(x)))
 
 
-class BasicBlock(nn.Module):
-    """Residual block 3x3, 3x3: fewer and narrower maps than a bottleneck's, which is what a CPU waits for."""
-
-    expansion = 1
-
-    def __init__(self, inside: int, width: int, *, halve: bool, blurs: bool) -> None:
-        super().__init__()
-        last = _convolution(width, width, 3)
-        self.conv1 = _convolution(inside, width, 3, stride=2 if halve and not blurs else 1)
-        self.bn1 = group_norm(width)
-        self.conv2 = nn.Sequential(Blur(width), last) if halve and blurs else last
-        self.bn2 = group_norm(width)
-        self.downsample = _shortcut(inside, width, halve=halve, blurs=blurs)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(B, inside, h, w) -> (B, width, h, w), or half of h and w."""
-        residual = functional.relu(self.bn1(self.conv1(x)))
-        residual = self.bn2(self.conv2(residual))
-        return functional.relu(residual + (x if self.downsample is None else self.downsample(x)))
-
-
 class Backbone(nn.Sequential):
     """Stem (a quarter of the resolution), then stages, each of half the resolution of the one before."""
 
     def __init__(self, preset: Preset) -> None:
-        bottleneck = preset.block == "bottleneck"
-        block: type[Bottleneck | BasicBlock] = Bottleneck if bottleneck else BasicBlock
-        stem: list[nn.Module] = [
-            _convolution(3, preset.stem_width, 7, stride=2 if preset.blurs else 4),
-            group_norm(preset.stem_width),
-            nn.ReLU(),
-        ]
-        if preset.blurs:
-            stem.append(nn.Sequential(nn.MaxPool2d(2, stride=1), Blur(preset.stem_width)))
-        stages = []
         inside = preset.stem_width
+        pool = nn.Sequential(nn.MaxPool2d(2, stride=1), Blur(inside))
+        stem = [nn.Conv2d(3, inside, 7, stride=2, padding=3, bias=False), group_norm(inside), nn.ReLU(), pool]
+        stages = []
         self.widths = []
         for stage, (width, depth) in enumerate(zip(preset.stage_widths, preset.stage_depths, strict=True)):
             blocks = []
             for position in range(depth):
                 halve = stage > 0 and position == 0
-                blocks.append(block(inside, width, halve=halve, blurs=preset.blurs))
-                inside = width * block.expansion
+                blocks.append(Bottleneck(inside, width, halve=halve))
+                inside = width * Bottleneck.expansion
             stages.append(nn.Sequential(*blocks))
             self.widths.append(inside)
         super().__init__(*stem, *stages)

@@ -12,10 +12,11 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from relpose_ros.network.backbone import Backbone
+from relpose_ros.network.backbone import Backbone, group_norm
+from relpose_ros.network.efficientnet import EfficientNetLite0
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from relpose_ros.network.presets import CorrelationSettings, Preset
 
@@ -136,6 +137,22 @@ class LayoutPool(nn.Module):
         return out
 
 
+class Refinement(nn.Module):
+    """Two 3x3 convolutions, added to what came in. (B, width, h, w) to the same."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(width, width, 3, padding=1, bias=False)
+        self.bn1 = group_norm(width)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1, bias=False)
+        self.bn2 = group_norm(width)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Add what the neighbourhood says."""
+        hidden = functional.relu(self.bn1(self.conv1(x)))
+        return functional.relu(x + self.bn2(self.conv2(hidden)))
+
+
 class Descriptors(nn.Module):
     """Unit-length local features at one stage's resolution, with the last stage's view of the whole."""
 
@@ -146,16 +163,18 @@ class Descriptors(nn.Module):
         self.stage = settings.stage
         self.local = nn.Conv2d(widths[settings.stage], width, 1)
         self.wide = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in widths[settings.stage + 1 :])
+        self.refine = nn.Sequential(*(Refinement(width) for _ in range(settings.descriptor_depth)))
         self.mix = nn.Conv2d(width, width, 3, padding=1)
 
-    def forward(self, maps: list[torch.Tensor]) -> torch.Tensor:
-        """Maps of all stages -> (B, descriptor width, h, w)."""
+    def forward(self, maps: Sequence[torch.Tensor | None]) -> torch.Tensor:
+        """Maps of all stages, of which those from the descriptors' on are read -> (B, width, h, w)."""
         local: torch.Tensor = self.local(maps[self.stage])
         for feature_map, convolution in zip(maps[self.stage + 1 :], self.wide, strict=True):
+            assert feature_map is not None
             local = local + functional.interpolate(
                 convolution(feature_map), size=local.shape[-2:], mode="bilinear", align_corners=False
             )
-        return functional.normalize(self.mix(functional.relu(local)), dim=1)
+        return functional.normalize(self.mix(self.refine(functional.relu(local))), dim=1)
 
 
 class Encoder(nn.Module):
@@ -163,7 +182,8 @@ class Encoder(nn.Module):
 
     def __init__(self, preset: Preset) -> None:
         super().__init__()
-        self.feature_extractor = Backbone(preset)
+        lite = preset.backbone == "efficientnet_lite0"
+        self.feature_extractor = EfficientNetLite0() if lite else Backbone(preset)
         widths = self.feature_extractor.widths
         self.feature_positional_encoding = (
             IndexEncoding(preset.max_views, preset.token_width) if preset.index_encoding else None
@@ -177,8 +197,13 @@ class Encoder(nn.Module):
 
     def look(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
         """What views say on their own: (B, 3, S, S) -> (B, F) pooled, and descriptors (B, C, h, w) if any."""
-        maps = self.feature_extractor.stage_maps(images)
-        pooled = maps[-1].mean((-2, -1)) if self.layout is None else self.layout(maps[-1])
+        return self.summarise(self.feature_extractor.stage_maps(images))
+
+    def summarise(self, maps: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """`look` from the maps of the backbone's stages on; those before the descriptors' are not read."""
+        last = maps[-1]
+        assert last is not None
+        pooled = last.mean((-2, -1)) if self.layout is None else self.layout(last)
         return pooled, None if self.descriptors is None else self.descriptors(maps)
 
     def relate(self, tokens: torch.Tensor) -> torch.Tensor:

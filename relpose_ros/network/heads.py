@@ -74,11 +74,15 @@ class CorrelationReader(nn.Module):
 
     def forward(self, maps_i: torch.Tensor, maps_j: torch.Tensor) -> torch.Tensor:
         """Unit descriptors of views i and of views j, (P, C, h, w) each -> (P, width)."""
-        cosine = maps_i.flatten(2).transpose(1, 2) @ maps_j.flatten(2)  # (P, places of i, places of j)
-        # One exponential serves both softmaxes; below e^40 no row of it can vanish in float32.
-        likeness = ((cosine - 1) * self.log_sharpness.exp().clamp(max=40)).exp()
+        sharpness = self.log_sharpness.exp().clamp(max=40)
+        descriptors_i, descriptors_j = (maps.flatten(2) * sharpness.sqrt() for maps in (maps_i, maps_j))
+        # One exponential, of a cosine less 1, serves both softmaxes; below e^40 no row of it can vanish in
+        # float32. All of it is done by products of matrices: these maps are what a training step waits for.
+        likeness = torch.baddbmm(-sharpness[None, None, None], descriptors_i.mT, descriptors_j).exp()
+        one = torch.ones_like(self.matched_at[:, :1])
         # Softmax over j's places: where a place of i is found. Softmax over i's: which places of j claim it.
-        found = likeness @ self.matched_at / likeness.sum(-1, keepdim=True)
+        found = likeness @ torch.cat([self.matched_at, one], -1)
+        found = found[..., :-1] / found[..., -1:]
         claims = 1 / likeness.sum(-2)[..., None]  # (P, places of j, 1)
         claimed = likeness @ torch.cat([self.claimed_by * claims, claims], -1)
         places = torch.cat([found, claimed], -1)

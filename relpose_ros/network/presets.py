@@ -32,6 +32,8 @@ class CorrelationSettings:
     match_width: int
     layout_widths: tuple[int, int]
     summary_width: int
+    descriptor_depth: int = 0
+    """Residual blocks between the maps of the stages and the descriptors."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,10 @@ class Preset:
     """Side of a crop, pixels."""
     crop_antialias: bool = False
     """Whether a crop is low-pass filtered when it is shrunk."""
+    backbone: Literal["residual", "efficientnet_lite0"] = "residual"
+    """What looks at a view. EfficientNet-Lite0 has sizes of its own: those of stem and stages here are the
+    residual network's."""
     stem_width: int = 64
-    block: Literal["bottleneck", "basic"] = "bottleneck"
-    blurs: bool = True
-    """Whether the backbone halves its resolution by anti-aliasing blurs, or by strides alone."""
     stage_widths: tuple[int, ...] = (64, 128, 256, 512)
     stage_depths: tuple[int, ...] = (3, 4, 6, 3)
     layout_width: int | None = None
@@ -100,11 +102,7 @@ PRESETS = {
         "compact",
         image_size=128,
         crop_antialias=True,
-        stem_width=32,
-        block="basic",
-        blurs=False,
-        stage_widths=(32, 64, 128, 256),
-        stage_depths=(1, 2, 2, 1),
+        backbone="efficientnet_lite0",
         layout_width=64,
         pooled_width=232,
         crop_frequencies=4,
@@ -122,6 +120,7 @@ PRESETS = {
             match_width=48,
             layout_widths=(64, 96),
             summary_width=256,
+            descriptor_depth=1,
         ),
     ),
 }

@@ -23,6 +23,8 @@ from relpose_ros.network.features import SceneFeatures, ViewFeatures
 from relpose_ros.network.heads import CorrelationReader, Regressor
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from relpose_ros.network.features import Index
     from relpose_ros.network.presets import Preset
 
@@ -86,9 +88,18 @@ class RelPose(nn.Module):
             pooled, maps = self.feature_extractor.look(images.flatten(0, -4))
         if lowered:
             pooled, maps = pooled.to(images.dtype), None if maps is None else maps.to(images.dtype)
-        if maps is not None:
-            maps = maps.reshape(*leading, *maps.shape[1:])
-        return ViewFeatures(pooled.reshape(*leading, -1), maps)
+        return _as_views(pooled, maps, leading)
+
+    def summarise(self, maps: Sequence[torch.Tensor | None]) -> ViewFeatures:
+        """`look` from the maps of the backbone's stages on, for who has kept those of a frozen backbone.
+
+        Args:
+            maps: (..., N, C_k, S / 2^(k+2), S / 2^(k+2)) of stage k; None where nothing is read of it.
+        """
+        last = maps[-1]
+        assert last is not None
+        flat = [None if each is None else each.flatten(0, -4) for each in maps]
+        return _as_views(*self.feature_extractor.summarise(flat), last.shape[:-3])
 
     def relate(self, view_features: ViewFeatures, crop_parameters: torch.Tensor) -> SceneFeatures:
         """Features of views that have heard each other.
@@ -228,3 +239,10 @@ class RelPose(nn.Module):
             first = torch.cat([first[..., 1:2, :], first[..., 1:, :]], -2)
             each = torch.cat([first[..., :1, :], each[..., 1:, :]], -2)
         return [each, first]
+
+
+def _as_views(pooled: torch.Tensor, maps: torch.Tensor | None, leading: torch.Size) -> ViewFeatures:
+    """(B, F) and (B, C, h, w) with the dimensions that B stands for."""
+    if maps is not None:
+        maps = maps.reshape(*leading, *maps.shape[1:])
+    return ViewFeatures(pooled.reshape(*leading, -1), maps)

@@ -20,12 +20,17 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
+    from relpose_ros.training.objective import Looks
+
     FloatArray = npt.NDArray[np.float64]
     Images = npt.NDArray[np.float32]
 
-FIELDS = ("images", "crop_parameters", "camera_from_object", "places", "image_sizes")
-"""What is used of a shard; see `relpose_ros.captures.shards`."""
-
+FIELDS = ("crop_parameters", "camera_from_object", "places", "image_sizes")
+"""What is used of a shard beside its images; see `relpose_ros.captures.shards`."""
+MAP = "map_{}"
+"""Instead of images: what leaves a stage of a backbone that is not trained, (M, N, C, h, w) float16. Images
+are changed at random before, if at all."""
+_MOST_STAGES = 8
 
 DRAWS = 20
 """How often another scan is drawn when one lacks views within the angle asked for."""
@@ -42,40 +47,41 @@ class Scans:
         """Take shards as `read_shard` gives them.
 
         Raises:
-            ShardError: There are none, or they differ in the size of their images.
+            ShardError: There are none, or they differ in the size of their images, or in the backbone that
+                looked at them.
         """
         if not shards:
             text = "there are no shards to learn from; make some with 'relpose_ros render'."
             raise ShardError(text)
+        self.stages = [stage for stage in range(_MOST_STAGES) if MAP.format(stage) in shards[0]]
+        """Of the backbone whose maps are there instead of images; none where there are images."""
+        looks = [MAP.format(stage) for stage in self.stages] or ["images"]
+        self._fields = (*looks, *FIELDS)
         for shard in shards:
-            if missing := [name for name in FIELDS if name not in shard]:
+            if missing := [name for name in self._fields if name not in shard]:
                 text = f"a shard lacks {missing[0]}.npy; render it again."
                 raise ShardError(text)
-            if shard["images"].shape[2:] != shards[0]["images"].shape[2:]:
-                sizes = f"{shard['images'].shape[2:]} and {shards[0]['images'].shape[2:]}"
-                text = f"shards of images of {sizes} do not mix; render them alike."
-                raise ShardError(text)
+            for name in looks:
+                if shard[name].shape[2:] != shards[0][name].shape[2:]:
+                    sizes = f"{shard[name].shape[2:]} and {shards[0][name].shape[2:]}"
+                    text = f"shards of {name} of {sizes} do not mix; render them alike."
+                    raise ShardError(text)
         self._shards = list(shards)
-        self._ends = np.cumsum([len(shard["images"]) for shard in shards])
+        self._ends = np.cumsum([len(shard["places"]) for shard in shards])
 
     def __len__(self) -> int:
         return int(self._ends[-1])
 
     @property
-    def image_size(self) -> int:
-        """Side of the crops, pixels."""
-        return int(self._shards[0]["images"].shape[2])
-
-    @property
     def views(self) -> int:
         """Views that every scan has at least."""
-        return min(int(shard["images"].shape[1]) for shard in self._shards)
+        return min(int(shard["places"].shape[1]) for shard in self._shards)
 
     def row(self, index: int) -> dict[str, npt.NDArray[Any]]:
-        """One scan: the arrays of `FIELDS`, without copying them."""
+        """One scan: its images or maps and the arrays of `FIELDS`, without copying them."""
         shard = int(np.searchsorted(self._ends, index, side="right"))
         within = index - len(self) if shard >= len(self._ends) else index - int(self._ends[shard])
-        return {name: self._shards[shard][name][within] for name in FIELDS}
+        return {name: self._shards[shard][name][within] for name in self._fields}
 
 
 def open_scans(folders: Iterable[Path]) -> Scans:
@@ -146,7 +152,7 @@ def make_batch(
         views: N.
         max_angle: Of `choose_views`, degrees.
         generator: The step's own.
-        augmentation: None for the scans as they are.
+        augmentation: None for the scans as they are. Maps of a backbone are taken as they are always.
 
     Raises:
         ShardError: There are scans of fewer views.
@@ -154,30 +160,37 @@ def make_batch(
     if views > scans.views:
         text = f"there are scans of {scans.views} views, and {views} were to be drawn; render scans of more."
         raise ShardError(text)
-    rows = []
+    drawn = []
     for _ in range(count):
         for _ in range(DRAWS):
             row = scans.row(int(generator.integers(len(scans))))
             chosen, within = choose_views(row["camera_from_object"], views, max_angle, generator)
             if within:
                 break
-        scan = _Scan(
-            images=np.asarray(row["images"][chosen], np.float32) / np.float32(255),
-            places=np.asarray(row["places"][chosen], np.float32),
-            crops=np.asarray(row["crop_parameters"][chosen], np.float64),
-            poses=np.asarray(row["camera_from_object"][chosen], np.float64),
-            across=2 * row["image_sizes"][chosen] / row["image_sizes"][chosen].min(-1, keepdims=True),
-        )
-        rows.append(scan if augmentation is None else _augment(scan, augmentation, generator))
-    images = np.stack([scan.images for scan in rows])
-    images -= np.array(IMAGE_MEAN, np.float32)
-    images /= np.array(IMAGE_STD, np.float32)
+        row = {name: np.asarray(array[chosen]) for name, array in row.items()}
+        drawn.append(row if augmentation is None or scans.stages else augmented(row, augmentation, generator))
+    together = {name: np.stack([row[name] for row in drawn]) for name in drawn[0]}
+    looks: Looks
+    if scans.stages:
+        looks = [None] * scans.stages[0]
+        looks += [torch.from_numpy(together[MAP.format(stage)]).float() for stage in scans.stages]
+    else:
+        looks = normalised(together["images"])
     return Batch(
-        images=torch.from_numpy(images).movedim(-1, -3),
-        crop_parameters=torch.from_numpy(np.stack([scan.crops for scan in rows])).float(),
-        camera_from_world=np.stack([scan.poses for scan in rows]),
-        places=torch.from_numpy(np.stack([scan.places for scan in rows])),
+        looks=looks,
+        crop_parameters=torch.from_numpy(together["crop_parameters"]).float(),
+        camera_from_world=together["camera_from_object"].astype(np.float64),
+        places=torch.from_numpy(together["places"].astype(np.float32)),
     )
+
+
+def normalised(images: npt.NDArray[Any]) -> torch.Tensor:
+    """Images as the network takes them. (..., S, S, 3) uint8, or 0 to 1 -> (..., 3, S, S)."""
+    scale = np.float32(255 if images.dtype == np.uint8 else 1)
+    scaled = images.astype(np.float32) / scale
+    scaled -= np.array(IMAGE_MEAN, np.float32)
+    scaled /= np.array(IMAGE_STD, np.float32)
+    return torch.from_numpy(scaled).movedim(-1, -3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,14 +209,32 @@ class _Scan:
     """(N, 2) width and height of the full image in halves of its shorter side."""
 
 
-def _augment(scan: _Scan, augmentation: Augmentation, generator: np.random.Generator) -> _Scan:
+def augmented(
+    row: Mapping[str, npt.NDArray[Any]], augmentation: Augmentation, generator: np.random.Generator
+) -> dict[str, npt.NDArray[Any]]:
+    """Views of a scan, changed at random: the arrays of `FIELDS`, and the images as float32 from 0 to 1."""
+    sizes = row["image_sizes"]
+    scan = _Scan(
+        images=np.asarray(row["images"], np.float32) / np.float32(255),
+        places=np.asarray(row["places"], np.float32),
+        crops=np.asarray(row["crop_parameters"], np.float64),
+        poses=np.asarray(row["camera_from_object"], np.float64),
+        across=2 * sizes / sizes.min(-1, keepdims=True),
+    )
     scan = replace(scan, images=_recolour(scan, augmentation, generator))
     if generator.random() < augmentation.mirror:
         scan = _mirror(scan)
     if generator.random() < augmentation.quarter_turns:
         for _ in range(int(generator.integers(1, 4))):
             scan = _quarter_turn(scan)
-    return scan
+            sizes = sizes[:, ::-1]
+    return {
+        "images": scan.images,
+        "crop_parameters": scan.crops,
+        "camera_from_object": scan.poses,
+        "places": scan.places,
+        "image_sizes": sizes,
+    }
 
 
 def _recolour(scan: _Scan, augmentation: Augmentation, generator: np.random.Generator) -> Images:

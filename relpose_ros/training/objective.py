@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from relpose_ros.network.relpose import RelPose
 
     FloatArray = npt.NDArray[np.float64]
+    Looks = torch.Tensor | list[torch.Tensor | None]
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,8 @@ class ObjectiveSettings:
     """Of the mean absolute error of translations, beside nats."""
     match_weight: float = 0.0
     """Of the cross entropy of matches between local descriptors, where it is known what each of them sees."""
+    match_places: int | None = None
+    """Places of each view that are asked where the other view shows them, drawn at random; None for all."""
     match_radius: float = 0.12
     """How far apart on the object two places may lie and still match, object radii: about one descriptor."""
 
@@ -52,8 +55,9 @@ class ObjectiveSettings:
 class Batch:
     """Scans of equally many views."""
 
-    images: torch.Tensor
-    """(B, N, 3, S, S), normalised as `relpose_ros.network.crops` does."""
+    looks: Looks
+    """(B, N, 3, S, S) images, normalised as `relpose_ros.network.crops` does; or what `RelPose.summarise`
+    takes: (B, N, C_k, h_k, w_k) maps of a frozen backbone."""
     crop_parameters: torch.Tensor
     """(B, N, 3)."""
     camera_from_world: FloatArray
@@ -83,6 +87,8 @@ class Targets:
     """(B, N, 3), in the preset's frame, first camera at distance 1."""
     places: torch.Tensor | None
     """Of the batch."""
+    asked: torch.Tensor | None
+    """(2, B, P, K) places, by rows of the map, of views i and of views j that are asked for their match."""
 
 
 def rotations_near(
@@ -158,7 +164,24 @@ def make_targets(
         rotations=torch.from_numpy(rotation @ rotation[:, :1].swapaxes(-1, -2)).float(),
         translations=torch.from_numpy(np.stack(translations)).float(),
         places=batch.places,
+        asked=_asked(batch.places, i, j, settings, generator),
     )
+
+
+def _asked(
+    places: torch.Tensor | None,
+    i: npt.NDArray[np.int64],
+    j: npt.NDArray[np.int64],
+    settings: ObjectiveSettings,
+    generator: np.random.Generator,
+) -> torch.Tensor | None:
+    if places is None or settings.match_weight == 0:
+        return None
+    on_object = np.isfinite(places[..., 0].flatten(2).numpy())  # (B, N, A)
+    seen = np.stack([on_object[:, i], on_object[:, j]])
+    count = settings.match_places or seen.shape[-1]
+    # The largest of random numbers: those on the object first, in random order.
+    return torch.from_numpy(np.argsort(-(seen + generator.random(seen.shape)), axis=-1)[..., :count].copy())
 
 
 def rotation_loss(energies: torch.Tensor, log_density: torch.Tensor) -> torch.Tensor:
@@ -181,41 +204,32 @@ def translation_loss(estimate: torch.Tensor, truth: torch.Tensor) -> torch.Tenso
     return (estimate.float() - truth).abs().mean()
 
 
-def match_logits(network: RelPose, features: SceneFeatures, i: list[int], j: list[int]) -> torch.Tensor:
-    """Likeness of all descriptors of views i to all of views j, as sharp as the network compares them.
-
-    -> (B * P, A, B): A places of view i, B of view j, row by row.
-    """
-    assert features.maps is not None
-    assert network.correlation is not None
-    descriptors = features.maps.flatten(-2)  # (B, N, C, A)
-    cosine = descriptors[:, i].mT @ descriptors[:, j]
-    return (cosine * network.correlation.log_sharpness.exp()).flatten(0, 1)
-
-
 def match_loss(
-    logits: torch.Tensor, places_i: torch.Tensor, places_j: torch.Tensor, radius: float
+    logits: torch.Tensor, places: torch.Tensor, other_places: torch.Tensor, radius: float
 ) -> torch.Tensor:
-    """Mean cross entropy of where places of one view are found in another, both ways.
+    """Mean cross entropy of where places of one view are found in another.
 
     The target spreads over the places of the other view near the same point of the object; a place whose
     point the other view does not see within ``radius`` takes no part.
 
     Args:
-        logits: (P, A, B) likeness of the A descriptors of views i and the B of views j.
-        places_i: (P, A, 3) what they see, nan where it is not the object.
-        places_j: (P, B, 3).
+        logits: (..., A, B) likeness of A descriptors of one view and B of another.
+        places: (..., A, 3) what the first see, nan where it is not the object.
+        other_places: (..., B, 3).
         radius: In the unit of the places.
     """
-    distance = torch.cdist(places_i.nan_to_num(1e3), places_j.nan_to_num(-1e3))
+    distance = torch.cdist(places.nan_to_num(1e3), other_places.nan_to_num(-1e3))
     near = torch.exp(-0.5 * (distance / (radius / 2)) ** 2) * (distance <= radius)
-    total = logits.new_zeros(())
-    for axis in (-1, -2):
-        mass = near.sum(axis)
-        entropy = -(near * logits.float().log_softmax(axis)).sum(axis) / mass.clamp(min=1e-6)
-        seen = mass > 0
-        total = total + (entropy * seen).sum() / seen.sum().clamp(min=1)
-    return total / 2
+    mass = near.sum(-1)
+    entropy = -(near * logits.float().log_softmax(-1)).sum(-1) / mass.clamp(min=1e-6)
+    seen = mass > 0
+    return (entropy * seen).sum() / seen.sum().clamp(min=1)
+
+
+def scene_features(network: RelPose, looks: Looks, crop_parameters: torch.Tensor) -> SceneFeatures:
+    """`RelPose.encode` of the ``looks`` of a batch."""
+    views = network.look(looks) if isinstance(looks, torch.Tensor) else network.summarise(looks)
+    return network.relate(views, crop_parameters)
 
 
 class Objective(nn.Module):
@@ -227,10 +241,15 @@ class Objective(nn.Module):
         self.network = network
         self._settings = settings
 
-    def forward(self, images: torch.Tensor, crop_parameters: torch.Tensor, targets: Targets) -> torch.Tensor:
+    def forward(
+        self,
+        looks: Looks,
+        crop_parameters: torch.Tensor,
+        targets: Targets,
+    ) -> torch.Tensor:
         """Loss and its parts. -> (4,): total, rotation (nats), translation, matches (nats)."""
         network, settings = self.network, self._settings
-        features = network.encode(images, crop_parameters)
+        features = scene_features(network, looks, crop_parameters)
         translation = translation_loss(network.optical_translations(features), targets.translations)
         if network.preset.rotation == "regression":
             # Six numbers have no likelihood: the mean absolute error of the matrix, as for translations.
@@ -238,21 +257,34 @@ class Objective(nn.Module):
         else:
             contexts = network.pair_contexts(features, targets.i, targets.j).float()
             # In full precision: energies of near rotations differ by less than half precision tells apart.
-            with torch.autocast(images.device.type, enabled=False):
+            with torch.autocast(contexts.device.type, enabled=False):
                 own = network.embed_relative(torch.cat([targets.true[:, :, None], targets.near], 2))
                 own_energies = network.pair_energies(contexts, own)
                 shared = network.pair_energies(contexts, network.embed_relative(targets.uniform))
                 energies = torch.cat([own_energies[..., :1], shared, own_energies[..., 1:]], -1)
                 rotation = rotation_loss(energies, targets.log_density)
-        matches = rotation.new_zeros(())
-        if settings.match_weight > 0 and targets.places is not None and features.maps is not None:
-            places = targets.places.flatten(2, 3)  # (B, N, A, 3)
-            logits = match_logits(network, features, targets.i, targets.j)
-            matches = match_loss(
-                logits,
-                places[:, targets.i].flatten(0, 1),
-                places[:, targets.j].flatten(0, 1),
-                settings.match_radius,
-            )
+        matches = self._matches(features, targets)
         total = rotation + settings.translation_weight * translation + settings.match_weight * matches
         return torch.stack([total, rotation, translation, matches])
+
+    def _matches(self, features: SceneFeatures, targets: Targets) -> torch.Tensor:
+        """The mean of both directions, as sharp as the network compares descriptors."""
+        if features.maps is None or targets.places is None or targets.asked is None:
+            return features.tokens.new_zeros(())
+        reader = self.network.correlation
+        assert reader is not None
+        places = targets.places.flatten(2, 3)  # (B, N, A, 3)
+        descriptors = features.maps.flatten(-2).mT * reader.log_sharpness.exp().sqrt()  # (B, N, A, C)
+        losses = []
+        for one, other, asked in (
+            (targets.i, targets.j, targets.asked[0]),
+            (targets.j, targets.i, targets.asked[1]),
+        ):
+            chosen = asked[..., None]
+            own, own_places = (
+                each[:, one].gather(2, chosen.expand(*asked.shape, each.shape[-1]))
+                for each in (descriptors, places)
+            )
+            logits = own @ descriptors[:, other].mT
+            losses.append(match_loss(logits, own_places, places[:, other], self._settings.match_radius))
+        return torch.stack(losses).mean()

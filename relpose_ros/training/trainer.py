@@ -27,7 +27,15 @@ from relpose_ros.geometry import so3, so3_grid
 from relpose_ros.network.checkpoint import load_network, random_network, read_metadata, write_network
 from relpose_ros.network.presets import named_preset
 from relpose_ros.training.batches import Augmentation, Scans, make_batch
-from relpose_ros.training.objective import Batch, Objective, ObjectiveSettings, Targets, make_targets
+from relpose_ros.training.imagenet import imagenet_backbone
+from relpose_ros.training.objective import (
+    Batch,
+    Objective,
+    ObjectiveSettings,
+    Targets,
+    make_targets,
+    scene_features,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -38,6 +46,7 @@ if TYPE_CHECKING:
     from relpose_ros.network.features import SceneFeatures
     from relpose_ros.network.presets import Preset
     from relpose_ros.network.relpose import RelPose
+    from relpose_ros.training.objective import Looks
 
     State = dict[str, Any]
     FloatArray = npt.NDArray[np.float64]
@@ -80,6 +89,8 @@ class TrainingSettings:
     curriculum: tuple[tuple[float, float], ...] = ((0.0, 45.0), (0.25, 90.0), (0.5, 180.0))
     """(share of the run, degrees): views of a scan lie within an angle of one of them, which is drawn
     for each step between the first of these and the one that the run has come to."""
+    pretrained_backbone: bool = False
+    """Whether the backbone has the weights of `relpose_ros.training.imagenet` and keeps them."""
     precision: str = "bfloat16"
     """Of the forward pass: float32, bfloat16, or float16 (GPU)."""
     objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
@@ -112,13 +123,29 @@ def settings_for(preset: str, variants: Sequence[str] = ()) -> TrainingSettings:
     else:
         settings = TrainingSettings(
             preset=preset,
-            objective=ObjectiveSettings(uniform_rotations=256, near_rotations=128, pairs=8, match_weight=0.5),
+            pretrained_backbone=network.backbone == "efficientnet_lite0",
+            precision="float32",
+            objective=ObjectiveSettings(
+                uniform_rotations=256, near_rotations=128, pairs=8, match_weight=0.5, match_places=40
+            ),
         )
     objective = settings.objective
     if network.rotation == "regression":
         # One rotation is predicted and none are compared: drawing many would be work for nothing.
         objective = replace(objective, uniform_rotations=1, near_rotations=0)
     return replace(settings, variants=tuple(variants), objective=objective)
+
+
+def initial_network(settings: TrainingSettings) -> RelPose:
+    """What a run begins with: weights drawn from its seed, and the backbone's own where it has some.
+
+    Raises:
+        PretrainedError: Those are not installed.
+    """
+    network = random_network(settings.network, settings.seed)
+    if settings.pretrained_backbone:
+        network.feature_extractor.feature_extractor.load_state_dict(imagenet_backbone().state_dict())
+    return network
 
 
 class Trainer:
@@ -154,6 +181,7 @@ class Trainer:
         Raises:
             TrainingError: The checkpoint is damaged, or it or the weights are of another network.
             NetworkFileError: The weights cannot be read.
+            PretrainedError: The weights that the backbone begins with are not installed.
         """
         self.settings = settings
         self.folder = folder
@@ -163,11 +191,14 @@ class Trainer:
         self._device = _own_device(device)
         self._rank, self._processes = _join(self._device)
         folder.mkdir(parents=True, exist_ok=True)
-        self.network = random_network(settings.network, settings.seed).to(self._device).train()
-        self.average = random_network(settings.network, settings.seed).to(self._device)
+        self.network = initial_network(settings).to(self._device).train()
+        if settings.pretrained_backbone:
+            self.network.feature_extractor.feature_extractor.requires_grad_(requires_grad=False)
+        self.average = initial_network(settings).to(self._device)
         self.average.requires_grad_(requires_grad=False)
-        decayed = [p for p in self.network.parameters() if p.ndim > 1]
-        plain = [p for p in self.network.parameters() if p.ndim <= 1]
+        trained = [p for p in self.network.parameters() if p.requires_grad]
+        decayed = [p for p in trained if p.ndim > 1]
+        plain = [p for p in trained if p.ndim <= 1]
         self._optimizer = torch.optim.AdamW(
             [
                 {"params": decayed, "weight_decay": settings.weight_decay},
@@ -256,7 +287,7 @@ class Trainer:
         self._scaler.step(self._optimizer)
         self._scaler.update()
         self.step += 1
-        seen = batch.images.shape[0] * batch.images.shape[1] * self._processes
+        seen = batch.crop_parameters.shape[0] * batch.crop_parameters.shape[1] * self._processes
         self.images += seen
         keep = float(np.exp(-seen / settings.average_images))
         if self._began is None:
@@ -354,7 +385,7 @@ class Trainer:
         mixed = precision is not torch.float32
         with torch.autocast(self._device.type, precision) if mixed else nullcontext():
             losses: torch.Tensor = self._objective(
-                batch.images.to(self._device),
+                _looks(batch, self._device),
                 batch.crop_parameters.to(self._device),
                 _moved(targets, self._device),
             )
@@ -491,7 +522,7 @@ def pair_accuracy(
     errors, angles = [], []
     for _ in range(count):
         batch = make_batch(scans, 1, views, 180.0, generator)
-        features = network.encode(batch.images.to(device), batch.crop_parameters.to(device))
+        features = scene_features(network, _looks(batch, device), batch.crop_parameters.to(device))
         best = best_rotations(network, features, i, j)
         rotation = batch.camera_from_world[0, :, :, :3]
         true = rotation[j] @ rotation[i].swapaxes(-1, -2)
@@ -581,6 +612,12 @@ def _join(device: torch.device) -> tuple[int, int]:
     return (distributed.get_rank(), processes) if processes > 1 else (0, 1)
 
 
+def _looks(batch: Batch, device: torch.device) -> Looks:
+    if isinstance(batch.looks, torch.Tensor):
+        return batch.looks.to(device)
+    return [None if each is None else each.to(device) for each in batch.looks]
+
+
 def _moved(targets: Targets, device: torch.device) -> Targets:
     return replace(
         targets,
@@ -591,6 +628,7 @@ def _moved(targets: Targets, device: torch.device) -> Targets:
         rotations=targets.rotations.to(device),
         translations=targets.translations.to(device),
         places=None if targets.places is None else targets.places.to(device),
+        asked=None if targets.asked is None else targets.asked.to(device),
     )
 
 

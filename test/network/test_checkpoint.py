@@ -356,8 +356,18 @@ def test_a_network_from_the_future_is_refused(saved: Path, compact: RelPose) -> 
 
     for changes in (
         *('{"wavelets": 3}', "[", "3", '{"correlation": {"stage": 1}}', '{"correlation": 5}'),
-        *('{"stem_width": -5}', '{"heads": "x"}', '{"stage_widths": [16, 32]}', '{"layers": null}'),
-        *('{"rotation": "spin"}', '{"block": 3}', '{"translation_frame": "lookat"}', '{"image_size": 1.5}'),
+        *(
+            '{"backbone": "residual", "stem_width": -5}',
+            '{"heads": "x"}',
+            '{"descriptor_depth": 1}',
+            '{"layers": null}',
+        ),
+        *(
+            '{"rotation": "spin"}',
+            '{"backbone": 3}',
+            '{"translation_frame": "lookat"}',
+            '{"image_size": 1.5}',
+        ),
     ):
         metadata = {"preset": "compact", "preset_changes": changes}
         safetensors.torch.save_file(compact.state_dict(), saved, metadata)

@@ -42,6 +42,7 @@ def tiny_preset(monkeypatch):
         compact,
         name="tiny",
         image_size=32,
+        backbone="residual",
         stem_width=8,
         stage_widths=(8, 16),
         stage_depths=(1, 1),

@@ -130,10 +130,10 @@ def test_a_batch_is_the_same_for_the_same_seed_and_another_for_another(fake_shar
         batches.make_batch(scans, 5, 3, 90.0, np.random.default_rng(seed), Augmentation())
         for seed in (1, 1, 2)
     ]
-    assert draw[0].images.shape == (5, 3, 3, 32, 32)
-    assert draw[0].images.equal(draw[1].images)
+    assert draw[0].looks.shape == (5, 3, 3, 32, 32)
+    assert draw[0].looks.equal(draw[1].looks)
     assert (draw[0].camera_from_world == draw[1].camera_from_world).all()
-    assert not draw[0].images.equal(draw[2].images)
+    assert not draw[0].looks.equal(draw[2].looks)
 
 
 def test_rows_come_from_the_right_shard(fake_shard):

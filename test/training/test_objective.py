@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import camera_centre, closest_point_to_axes
+from relpose_ros.network.checkpoint import random_network
 from relpose_ros.network.presets import PRESETS, VARIANTS, named_preset
 from relpose_ros.network.relpose import RelPose
 from relpose_ros.training import objective
@@ -139,11 +140,51 @@ def test_match_loss_rewards_the_true_matches_and_ignores_what_is_not_seen_twice(
     ignorant = objective.match_loss(torch.zeros(1, 4, 4), places, other, 0.1)
     assert ignorant.item() == pytest.approx(math.log(4), abs=1e-4)
     changed = right.clone()
-    changed[0, 2, 3:] = 0.5  # rows and columns without a match but the last column have no say
+    changed[0, 2, 3:] = 0.5  # rows without a match have no say
     changed[0, 3, 0] = 9.0
     assert objective.match_loss(changed, places, other, 0.1).item() == pytest.approx(0, abs=1e-4)
     nothing = torch.full_like(places, math.nan)
     assert objective.match_loss(right, nothing, other, 0.1).item() == 0
+
+
+def test_the_places_asked_of_are_on_the_object_as_far_as_there_are_any():
+    generator = np.random.default_rng(0)
+    places = generator.normal(size=(2, 4, 4, 4, 3)).astype(np.float32)
+    places[generator.random(places.shape[:-1]) < 0.5] = np.nan
+    places[1, 2] = np.nan
+    batch = dataclasses.replace(batch_of(0), places=torch.from_numpy(places))
+    settings = ObjectiveSettings(uniform_rotations=5, match_weight=0.5, match_places=3)
+    targets = objective.make_targets(batch, settings, generator, translation_frame="look_at")
+    assert targets.asked.shape == (2, 2, 6, 3)
+    on_object = np.isfinite(places[..., 0]).reshape(2, 4, 16)
+    for asked, views in zip(targets.asked.numpy(), (targets.i, targets.j), strict=True):
+        for scan in range(2):
+            for pair, view in enumerate(views):
+                seen = on_object[scan, view]
+                assert len(set(asked[scan, pair])) == 3
+                assert seen[asked[scan, pair]].sum() == min(3, seen.sum())
+
+
+def test_asked_of_all_places_a_match_costs_what_match_loss_says(tiny_preset):
+    generator = np.random.default_rng(1)
+    batch = dataclasses.replace(
+        batch_of(1), places=torch.from_numpy(generator.normal(size=(2, 4, 4, 4, 3)).astype(np.float32))
+    )
+    settings = ObjectiveSettings(uniform_rotations=5, match_weight=0.5, match_radius=0.8)
+    network = random_network(tiny_preset, 0)
+    targets = objective.make_targets(batch, settings, generator, translation_frame="look_at")
+    images = torch.from_numpy(generator.normal(size=(2, 4, 3, 32, 32)).astype(np.float32))
+    with torch.no_grad():
+        found = Objective(network, settings)(images, batch.crop_parameters, targets)[3]
+        descriptors = network.encode(images, batch.crop_parameters).maps.flatten(-2)
+        likeness = descriptors[:, targets.i].mT @ descriptors[:, targets.j]
+        likeness = likeness * network.correlation.log_sharpness.exp()
+        places = batch.places.flatten(2, 3)
+        one, other = places[:, targets.i], places[:, targets.j]
+        forth = objective.match_loss(likeness, one, other, 0.8)
+        back = objective.match_loss(likeness.mT, other, one, 0.8)
+    assert forth > 0.1
+    assert found.item() == pytest.approx((forth + back).item() / 2, abs=1e-4)
 
 
 @pytest.mark.parametrize("variants", [(), *((name,) for name in VARIANTS), ("regression", "first-camera")])
@@ -159,7 +200,8 @@ def test_nothing_is_left_on_the_cpu_when_the_weights_are_elsewhere(name, variant
     )
     if preset.correlation is not None:
         side = preset.correlation.map_side
-        targets = dataclasses.replace(targets, places=torch.zeros(2, 4, side, side, 3))
+        places = torch.zeros(2, 4, side, side, 3)
+        targets = dataclasses.replace(targets, places=places, asked=torch.zeros(2, 2, 6, 3, dtype=torch.long))
     images = torch.empty(2, 4, 3, preset.image_size, preset.image_size, device="meta")
     monkeypatch.setattr(torch, "autocast", lambda device, enabled: nullcontext())  # which that device lacks
     meta = torch.device("meta")

@@ -1,0 +1,82 @@
+"""EfficientNet-Lite0 (Tan and Le, ICML 2019; the variant for devices without squeeze and excitation).
+
+Sizes are its own, so that its public ImageNet weights fit; batch norms are folded into the convolutions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+
+@dataclass(frozen=True)
+class _Stage:
+    depth: int
+    width: int
+    kernel: int
+    stride: int
+    expansion: int
+
+
+_STEM_WIDTH = 32
+_STAGES = (
+    _Stage(1, 16, 3, 1, 1),
+    _Stage(2, 24, 3, 2, 6),
+    _Stage(2, 40, 5, 2, 6),
+    _Stage(3, 80, 3, 2, 6),
+    _Stage(3, 112, 5, 1, 6),
+    _Stage(4, 192, 5, 2, 6),
+    _Stage(1, 320, 3, 1, 6),
+)
+_LAST_OF_RESOLUTION = (1, 2, 4, 6)
+"""Stages after which the map is given: at a quarter, an eighth, a 16th and a 32nd of the image's side."""
+
+
+class InvertedResidual(nn.Module):
+    """Expansion, depthwise convolution, projection; added to what came in where shapes allow."""
+
+    def __init__(self, inside: int, stage: _Stage, stride: int) -> None:
+        super().__init__()
+        hidden = inside * stage.expansion
+        self.expand = nn.Conv2d(inside, hidden, 1) if stage.expansion > 1 else None
+        self.depthwise = nn.Conv2d(
+            hidden, hidden, stage.kernel, stride=stride, padding=stage.kernel // 2, groups=hidden
+        )
+        self.project = nn.Conv2d(hidden, stage.width, 1)
+        self.adds = stride == 1 and inside == stage.width
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(B, inside, h, w) -> (B, width, h, w), or half of h and w."""
+        hidden = x if self.expand is None else functional.relu6(self.expand(x))
+        out: torch.Tensor = self.project(functional.relu6(self.depthwise(hidden)))
+        return x + out if self.adds else out
+
+
+class EfficientNetLite0(nn.Module):
+    """Stem and seven stages; a map is given at four resolutions."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.widths = [_STAGES[position].width for position in _LAST_OF_RESOLUTION]
+        self.stem = nn.Conv2d(3, _STEM_WIDTH, 3, stride=2, padding=1)
+        self.stages = nn.ModuleList()
+        inside = _STEM_WIDTH
+        for stage in _STAGES:
+            blocks = []
+            for position in range(stage.depth):
+                blocks.append(InvertedResidual(inside, stage, stage.stride if position == 0 else 1))
+                inside = stage.width
+            self.stages.append(nn.Sequential(*blocks))
+
+    def stage_maps(self, images: torch.Tensor) -> list[torch.Tensor]:
+        """(B, 3, S, S) -> [(B, C_k, S / 2^(k+2), S / 2^(k+2))] for k = 0 to 3."""
+        x = functional.relu6(self.stem(images.contiguous(memory_format=torch.channels_last)))
+        maps = []
+        for position, stage in enumerate(self.stages):
+            x = stage(x)
+            if position in _LAST_OF_RESOLUTION:
+                maps.append(x)
+        return maps
