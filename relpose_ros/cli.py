@@ -1,4 +1,4 @@
-"""The command line: ``relpose_ros {node, replay, pack, evaluate, calibrate, render, shard, train, convert}``.
+"""The command line: ``relpose_ros COMMAND``, from the node and the replay of bags to the training of weights.
 
 Each command is a few lines into a function that a program could call as well. What a command needs is
 imported when it runs, so that ``relpose_ros replay`` works without ROS and ``--help`` is quick.

@@ -18,7 +18,10 @@ from relpose_ros.network.presets import named_preset
 from relpose_ros.training.batches import open_scans
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
-COMMANDS = ("node", "replay", "pack", "evaluate", "calibrate", "render", "shard", "train", "convert")
+COMMANDS = (
+    *("node", "replay", "pack", "evaluate", "calibrate"),
+    *("render", "shard", "features", "train", "convert"),
+)
 
 
 @pytest.fixture

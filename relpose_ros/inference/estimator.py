@@ -154,7 +154,7 @@ class Estimator:
             path: of a weights file; None for the shipped compact weights.
             threads: for torch and OpenCV, of the whole process; None or 0 leaves their own choice.
             evidence: what else than the network to rest on.
-            backbone_in_bfloat16: sooner on some processors, and less exact.
+            backbone_in_bfloat16: of the published network: sooner on some processors, and less exact.
 
         Raises:
             NetworkFileError: if the file is missing or is none of ours.

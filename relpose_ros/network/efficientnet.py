@@ -1,6 +1,9 @@
 """EfficientNet-Lite0 (Tan and Le, ICML 2019; the variant for devices without squeeze and excitation).
 
 Sizes are its own, so that its public ImageNet weights fit; batch norms are folded into the convolutions.
+Convolutions are padded alike on all sides. TensorFlow, where the weights come from, pads those of stride 2 on
+the right and below: it samples the same features half a stride further down and right, and at the border of a
+crop they are not quite those that were trained.
 """
 
 from __future__ import annotations
@@ -70,6 +73,12 @@ class EfficientNetLite0(nn.Module):
                 blocks.append(InvertedResidual(inside, stage, stage.stride if position == 0 else 1))
                 inside = stage.width
             self.stages.append(nn.Sequential(*blocks))
+        for module in self.modules():
+            # Without norms, smaller weights let what an image says fade from block to block.
+            if isinstance(module, nn.Conv2d) and not module.weight.is_meta:
+                nn.init.kaiming_normal_(module.weight, mode="fan_in", nonlinearity="relu")
+                assert module.bias is not None
+                nn.init.zeros_(module.bias)
 
     def stage_maps(self, images: torch.Tensor) -> list[torch.Tensor]:
         """(B, 3, S, S) -> [(B, C_k, S / 2^(k+2), S / 2^(k+2))] for k = 0 to 3."""

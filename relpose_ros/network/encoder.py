@@ -190,9 +190,14 @@ class Encoder(nn.Module):
         )
         self.transformer = nn.Sequential(Transformer(preset), nn.LayerNorm(preset.token_width))
         self.layout = None
+        first = len(widths) - 1 if preset.correlation is None else preset.correlation.stage
+        sides = [preset.image_size // 2 ** (stage + 2) for stage in range(len(widths))]
+        self.summarised_shapes = {
+            stage: (widths[stage], sides[stage], sides[stage]) for stage in range(first, len(widths))
+        }
+        """(C, h, w) of the maps of those stages that `summarise` reads."""
         if preset.layout_width is not None:
-            side = preset.image_size // 2 ** (len(widths) + 1)
-            self.layout = LayoutPool(widths[-1], side, preset.layout_width, preset.pooled_width)
+            self.layout = LayoutPool(widths[-1], sides[-1], preset.layout_width, preset.pooled_width)
         self.descriptors = None if preset.correlation is None else Descriptors(preset.correlation, widths)
 
     def look(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:

@@ -72,12 +72,26 @@ class CorrelationReader(nn.Module):
             nn.Linear(settings.summary_width, width),
         )
 
+    @property
+    def sharpness(self) -> torch.Tensor:
+        """By which cosines are multiplied before a softmax: at most 40, below which no row can vanish."""
+        return self.log_sharpness.exp().clamp(max=40)
+
     def forward(self, maps_i: torch.Tensor, maps_j: torch.Tensor) -> torch.Tensor:
         """Unit descriptors of views i and of views j, (P, C, h, w) each -> (P, width)."""
-        sharpness = self.log_sharpness.exp().clamp(max=40)
+        # In full precision: in half of it the sums of a softmax overflow or vanish.
+        with torch.autocast(maps_i.device.type, enabled=False):
+            places = self._matched(maps_i.to(self.matched_at.dtype), maps_j.to(self.matched_at.dtype))
+        layout = places.reshape(-1, self.side, self.side, places.shape[-1]).movedim(-1, 1)
+        out: torch.Tensor = self.read_layout(layout)
+        return out
+
+    def _matched(self, maps_i: torch.Tensor, maps_j: torch.Tensor) -> torch.Tensor:
+        """Where each place of i is found in j, and which places of i claim that of j: (P, places, values)."""
+        sharpness = self.sharpness
         descriptors_i, descriptors_j = (maps.flatten(2) * sharpness.sqrt() for maps in (maps_i, maps_j))
-        # One exponential, of a cosine less 1, serves both softmaxes; below e^40 no row of it can vanish in
-        # float32. All of it is done by products of matrices: these maps are what a training step waits for.
+        # One exponential, of a cosine less 1, serves both softmaxes. All else is done by products of
+        # matrices: these maps are what a training step waits for.
         likeness = torch.baddbmm(-sharpness[None, None, None], descriptors_i.mT, descriptors_j).exp()
         one = torch.ones_like(self.matched_at[:, :1])
         # Softmax over j's places: where a place of i is found. Softmax over i's: which places of j claim it.
@@ -85,10 +99,7 @@ class CorrelationReader(nn.Module):
         found = found[..., :-1] / found[..., -1:]
         claims = 1 / likeness.sum(-2)[..., None]  # (P, places of j, 1)
         claimed = likeness @ torch.cat([self.claimed_by * claims, claims], -1)
-        places = torch.cat([found, claimed], -1)
-        layout = places.reshape(-1, self.side, self.side, places.shape[-1]).movedim(-1, 1)
-        out: torch.Tensor = self.read_layout(layout)
-        return out
+        return torch.cat([found, claimed], -1)
 
 
 def _cosine_basis(side: int, count: int) -> torch.Tensor:

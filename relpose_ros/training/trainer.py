@@ -6,6 +6,7 @@ learning rate depends on the images seen. So a run that is resumed goes on as if
 
 from __future__ import annotations
 
+import copy
 import csv
 import hashlib
 import io
@@ -25,7 +26,7 @@ from torch.utils.data import DataLoader, Dataset
 from relpose_ros.errors import RelPoseError
 from relpose_ros.geometry import so3, so3_grid
 from relpose_ros.network.checkpoint import load_network, random_network, read_metadata, write_network
-from relpose_ros.network.presets import named_preset
+from relpose_ros.network.presets import Preset, named_preset
 from relpose_ros.training.batches import Augmentation, Scans, make_batch
 from relpose_ros.training.imagenet import imagenet_backbone
 from relpose_ros.training.objective import (
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from relpose_ros.network.features import SceneFeatures
-    from relpose_ros.network.presets import Preset
     from relpose_ros.network.relpose import RelPose
     from relpose_ros.training.objective import Looks
 
@@ -55,6 +55,8 @@ if TYPE_CHECKING:
 
 PIECE_BYTES = 16 * 2**20
 """Size of the pieces a checkpoint is cut into, so that it passes through stores that refuse large files."""
+_BACKBONE = "feature_extractor.feature_extractor."
+"""How the names of its weights begin."""
 CURVE = "curve.csv"
 WEIGHTS = "weights.safetensors"
 _COLUMNS = ("step", "images", "seconds", "images_per_second", "learning_rate", "max_angle")
@@ -89,8 +91,6 @@ class TrainingSettings:
     curriculum: tuple[tuple[float, float], ...] = ((0.0, 45.0), (0.25, 90.0), (0.5, 180.0))
     """(share of the run, degrees): views of a scan lie within an angle of one of them, which is drawn
     for each step between the first of these and the one that the run has come to."""
-    pretrained_backbone: bool = False
-    """Whether the backbone has the weights of `relpose_ros.training.imagenet` and keeps them."""
     precision: str = "bfloat16"
     """Of the forward pass: float32, bfloat16, or float16 (GPU)."""
     objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
@@ -101,6 +101,11 @@ class TrainingSettings:
     def network(self) -> Preset:
         """The preset with its variants."""
         return named_preset(self.preset, self.variants)
+
+    @property
+    def frozen_backbone(self) -> bool:
+        """Whether the backbone has the weights of `relpose_ros.training.imagenet` and keeps them."""
+        return self.network.backbone == "efficientnet_lite0"
 
 
 def settings_for(preset: str, variants: Sequence[str] = ()) -> TrainingSettings:
@@ -123,8 +128,7 @@ def settings_for(preset: str, variants: Sequence[str] = ()) -> TrainingSettings:
     else:
         settings = TrainingSettings(
             preset=preset,
-            pretrained_backbone=network.backbone == "efficientnet_lite0",
-            precision="float32",
+            precision="float32",  # few CPUs have another that is sooner
             objective=ObjectiveSettings(
                 uniform_rotations=256, near_rotations=128, pairs=8, match_weight=0.5, match_places=40
             ),
@@ -143,7 +147,7 @@ def initial_network(settings: TrainingSettings) -> RelPose:
         PretrainedError: Those are not installed.
     """
     network = random_network(settings.network, settings.seed)
-    if settings.pretrained_backbone:
+    if settings.frozen_backbone:
         network.feature_extractor.feature_extractor.load_state_dict(imagenet_backbone().state_dict())
     return network
 
@@ -191,11 +195,13 @@ class Trainer:
         self._device = _own_device(device)
         self._rank, self._processes = _join(self._device)
         folder.mkdir(parents=True, exist_ok=True)
-        self.network = initial_network(settings).to(self._device).train()
-        if settings.pretrained_backbone:
-            self.network.feature_extractor.feature_extractor.requires_grad_(requires_grad=False)
-        self.average = initial_network(settings).to(self._device)
-        self.average.requires_grad_(requires_grad=False)
+        goes_on = (folder / "checkpoint.json").exists()
+        network = random_network(settings.network, settings.seed) if goes_on else initial_network(settings)
+        self.network = network.to(self._device).train()
+        self.average = copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
+        if settings.frozen_backbone:
+            network.feature_extractor.feature_extractor.requires_grad_(requires_grad=False)
+        self._check_fit(scans, held_out)
         trained = [p for p in self.network.parameters() if p.requires_grad]
         decayed = [p for p in trained if p.ndim > 1]
         plain = [p for p in trained if p.ndim <= 1]
@@ -220,7 +226,7 @@ class Trainer:
         self._began: int | None = None
         """Images that the weights had seen which were given to begin with; None: they were random."""
         self._seconds = 0.0
-        if (folder / "checkpoint.json").exists():
+        if goes_on:
             self._resume()
         elif start_from is not None:
             self._begin_with(start_from)
@@ -341,8 +347,13 @@ class Trainer:
 
     def _resume(self) -> None:
         state = load_pieces(self.folder)
-        # As JSON a tuple and a list are the same.
-        if json.dumps(state["preset"]) != json.dumps(asdict(self.settings.network)):
+        # As JSON a tuple and a list are the same. What has come to presets since a checkpoint was written had
+        # its default before; what has gone no longer matters.
+        fields = asdict(Preset("")).keys()
+        stored = asdict(Preset("")) | {
+            name: state["preset"][name] for name in fields & state["preset"].keys()
+        }
+        if json.dumps(stored) != json.dumps(asdict(self.settings.network)):
             text = (
                 f"the checkpoint in {self.folder} is of another network than {self._asked()}; "
                 "name another folder."
@@ -362,9 +373,27 @@ class Trainer:
         if begun.preset != self.settings.network:
             text = f"{weights} holds another network than {self._asked()}; name its preset and variants."
             raise TrainingError(text)
+        state = begun.state_dict()
+        if self.settings.frozen_backbone:
+            # In the full precision in which it looks, where the file has half of it.
+            state |= {
+                name: value for name, value in self.network.state_dict().items() if name.startswith(_BACKBONE)
+            }
         for network in (self.network, self.average):
-            network.load_state_dict(begun.state_dict())
+            network.load_state_dict(state)
         self.images = self._began = int(read_metadata(weights).get("images_seen", "0"))
+
+    def _check_fit(self, scans: Scans, held_out: Scans | None) -> None:
+        """Refuse maps of a backbone that this network does not read, or would train on."""
+        shapes = self.network.feature_extractor.summarised_shapes
+        for each in (scans, *([] if held_out is None else [held_out])):
+            if each.map_shapes and not (self.settings.frozen_backbone and each.map_shapes == shapes):
+                side = self.settings.network.image_size
+                text = (
+                    f"the shards hold features of another backbone than that of {self._asked()}, or of "
+                    f"images not {side} pixels wide; give it shards of images."
+                )
+                raise TrainingError(text)
 
     def _asked(self) -> str:
         return "'" + " + ".join([self.settings.preset, *self.settings.variants]) + "'"

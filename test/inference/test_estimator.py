@@ -3,6 +3,7 @@ from __future__ import annotations
 import gc
 import math
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.estimator import Estimator, EvidenceSettings, ScanError
 from relpose_ros.inference.predictions import regressed_poses
 from relpose_ros.network.checkpoint import random_network, write_network
-from relpose_ros.network.presets import named_preset
+from relpose_ros.network.presets import PRESETS, named_preset
 from relpose_ros.views import BoundingBox, RobotPose, Scan, View
 
 
@@ -135,7 +136,7 @@ def test_other_evidence_on_the_same_weights(network):
     assert len(given._looks) == 0
 
 
-@pytest.mark.parametrize("seed", [1, 13, 20, 22])
+@pytest.mark.parametrize("seed", [6, 12, 31, 53])
 def test_two_views_are_told_as_their_most_probable_mode(network, seed):
     """Other peaks of these pairs are higher, and narrower: without probabilities the highest one is told."""
     calibrated, plain = (
@@ -189,9 +190,10 @@ def test_weights_bring_their_calibration(network, tmp_path):
         assert turn < np.radians(0.5), "a temperature moves no joint maximum"
 
 
-def test_a_backbone_in_bfloat16_is_asked_for_when_weights_are_loaded(network, tmp_path):
+def test_a_backbone_in_bfloat16_is_asked_for_when_weights_are_loaded(tmp_path):
     file = tmp_path / "weights.safetensors"
-    write_network(network, file)
+    residual = replace(PRESETS["compact"], backbone="residual", stage_depths=(1, 1, 1, 1))
+    write_network(random_network(residual, 1), file)
     exact, lowered = (
         Estimator.from_weights(
             file, evidence=EvidenceSettings("network"), backbone_in_bfloat16=lower

@@ -42,3 +42,21 @@ def test_each_stage_halves_the_one_before_from_a_quarter_on() -> None:
     assert [tuple(m.shape) for m in maps] == [
         (2, w, s, s) for w, s in zip(backbone.widths, (16, 8, 4), strict=True)
     ]
+
+
+@torch.no_grad()
+def test_blurs_make_features_steadier_under_a_shift_of_one_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Why the paper has them: the same random network, with them and with every second pixel instead."""
+    generator = torch.Generator().manual_seed(0)
+    image = torch.nn.functional.interpolate(
+        torch.randn(4, 3, 24, 24, generator=generator), 128, mode="bicubic"
+    )
+    torch.manual_seed(0)
+    backbone = Backbone(replace(Preset("small"), stem_width=16, stage_widths=(16, 32), stage_depths=(1, 1)))
+    changes = []
+    for blurs in (True, False):
+        if not blurs:
+            monkeypatch.setattr(Blur, "forward", lambda _self, x: x[..., ::2, ::2])
+        before, after = (backbone.stage_maps(part)[1] for part in (image[..., :-1], image[..., 1:]))
+        changes.append(((before - after).norm() / before.norm()).item())
+    assert changes[0] < 0.8 * changes[1]

@@ -205,7 +205,7 @@ def test_other_metadata_is_kept_through_writing_and_conversion(saved: Path, tmp_
         {"index_encoding": False},
         {"pair_context": True, "translation_frame": "first_camera"},
         {"rotation": "regression", "correlation": None},
-        {"stage_widths": (16, 32, 64, 128), "name": "tiny"},
+        {"backbone": "residual", "stage_widths": (16, 32, 64, 128), "name": "tiny"},
         {"correlation": replace(PRESETS["compact"].correlation, layout_widths=(32, 48))},  # type: ignore[type-var]
     ],
 )

