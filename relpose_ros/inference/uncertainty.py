@@ -76,14 +76,11 @@ def describe_pairs(
         spoken = Evidence.GEOMETRIC in _evidence(energies, pair)
         mode_spread = 1.0 if spoken else calibration.pair_spread
         strongest = int(by_weight[0])
+        told = by_weight[(weights[by_weight] >= LEAST_WEIGHT) | (by_weight == strongest)]
+        cores = _cores(distributions, pair, centres[told], basins[told]) * mode_spread
         modes = tuple(
-            Mode(
-                camera_j_from_camera_i=centres[mode].numpy(),
-                weight=float(weights[mode]),
-                covariance=_core(distributions, pair, centres[mode], basins[mode]) * mode_spread,
-            )
-            for mode in by_weight.tolist()
-            if mode == strongest or weights[mode] >= LEAST_WEIGHT
+            Mode(camera_j_from_camera_i=centres[mode].numpy(), weight=float(weights[mode]), covariance=core)
+            for mode, core in zip(told.tolist(), cores, strict=True)
         )
         ambiguous = len(modes) > 1 and modes[1].weight >= RUNNER_UP_WEIGHT
         to_solution = _angles(distributions.rotations[pair], solved[pair : pair + 1])[:, 0]
@@ -193,24 +190,35 @@ def _second_moment(
     return _moment(share, vectors) + _least_moment(distributions)
 
 
-def _core(
-    distributions: PairDistributions, pair: int, centre: torch.Tensor, mass: torch.Tensor
+def _cores(
+    distributions: PairDistributions, pair: int, centres: torch.Tensor, basins: torch.Tensor
 ) -> FloatArray:
-    """As `_second_moment`, of the mode's core: the further out, the less the mass counts. -> (3, 3) rad^2.
+    """As `_second_moment`, of modes' cores: the further out, the less the mass counts. -> (M, 3, 3) rad^2.
 
     The scatter of the Student's t that suits the masses best (Kent and Tyler 1991), in the measure in which a
     Gaussian has its own covariance. A few near misses, degrees off, would be most of a second moment, and
     hide how exact the rest is.
+
+    Args:
+        distributions: of the pairs.
+        pair: the one.
+        centres: (M, 3, 3) of its modes.
+        basins: (M, L) the masses that each owns; a cell has one owner at most.
     """
-    share, vectors = _turns_from(distributions, pair, centre, mass)
-    least = _least_moment(distributions)
-    scatter = _moment(share, vectors) + least
+    owned, owners = basins.max(0)
+    used = owned > 1e-9 * owned.max()
+    from_owner = distributions.rotations[pair][used] @ centres[owners[used]].mT
+    vectors = _turns(from_owner.numpy())
+    squares = (vectors[:, :, None] * vectors[:, None, :]).reshape(-1, 9)
+    share = (basins[:, used] / basins[:, used].sum(1, keepdim=True)).numpy()
+    least = _least_moment(distributions).reshape(9)
+    scatter = share @ squares + least
     for _ in range(CORE_ROUNDS):
-        squares = ((vectors @ np.linalg.inv(scatter)) * vectors).sum(1)
-        weights = share * (FREEDOM + 3) / (FREEDOM + squares)
+        information = np.linalg.inv(scatter.reshape(-1, 3, 3)).reshape(-1, 9)
+        weights = share * (FREEDOM + 3) / (FREEDOM + information @ squares.T)
         # At the end the weights sum to one; made so in every round, they get there sooner (Kent et al. 1994).
-        scatter = _moment(weights / weights.sum(), vectors) + least
-    return np.asarray(scatter / OF_GAUSSIAN)
+        scatter = weights / weights.sum(1, keepdims=True) @ squares + least
+    return scatter.reshape(-1, 3, 3) / OF_GAUSSIAN
 
 
 def _moment(weights: FloatArray, vectors: FloatArray) -> FloatArray:
