@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from relpose_ros import cli
 from relpose_ros.captures.folder import Frame, save_capture
 from relpose_ros.geometry.cameras import look_at, translation_of
 from relpose_ros.network.checkpoint import random_network, read_metadata, write_network
-from relpose_ros.network.presets import named_preset
+from relpose_ros.network.presets import PRESETS, named_preset
 from relpose_ros.training.batches import open_scans
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
@@ -48,7 +49,9 @@ def posed_capture(tmp_path):
 def random_weights(tmp_path):
     """A weights file of a network that learned nothing."""
     file = tmp_path / "random.safetensors"
-    write_network(random_network("compact", 0), file, {"source": "random, for a test"})
+    # With a backbone that the parameter `precision` means something to.
+    preset = replace(PRESETS["compact"], backbone="residual", stage_depths=(1, 1, 1, 1))
+    write_network(random_network(preset, 0), file, {"source": "random, for a test"})
     return file
 
 
