@@ -33,6 +33,9 @@ VIEWS = (3, 4, 5, 8)
 """Numbers of views that take turns; fewer where a capture has fewer."""
 SCANS = 24
 """A group, to fit on; as many others to measure on."""
+LEAST_FLAT = 0.05
+"""How often a network may be plainly wrong of a pair at least, whatever the fit says: a robot's objects are
+not those of the fit, and a pair that is surely wrong outvotes all else."""
 
 Reports = dict[str, tuple["CalibrationReport", "CalibrationReport"]]
 """By group: uncalibrated and calibrated."""
@@ -86,7 +89,7 @@ def calibrate(
             drawn = _scans(captures, seed)
             fitted_on += [observed(*scan) for scan in islice(drawn, scans)]
             others[name] = [observed(*scan) for scan in islice(drawn, scans)]
-    calibration = fit_calibration(fitted_on)
+    calibration = fit_calibration(fitted_on, LEAST_FLAT)
     metadata = {**read_metadata(weights), "calibration": calibration.to_json()}
     write_network(network, output, metadata, half=half)
     reports = {

@@ -142,31 +142,37 @@ def observe(
     return Observation(energies, distributions, solutions, predicted, rotations, about_look_at, at_truth)
 
 
-def log_likelihood(
-    observations: Sequence[Observation], temperature: float, flat: float | None = None
-) -> float:
+def log_likelihood(observations: Sequence[Observation], temperature: float, flat: float) -> float:
     """Mean over all pairs of the log density of the truth relative to uniform, nats.
 
     Args:
         observations: Held-out scans.
         temperature: By which energies are divided.
-        flat: Share of the uniform distribution; None for the best of `FLAT_SHARES`.
+        flat: Share of the uniform distribution.
     """
     parts = [
         o.energy_at_truth / temperature - o.distributions.log_normaliser(temperature) for o in observations
     ]
     densities = torch.cat(parts).exp()
-    shares = FLAT_SHARES if flat is None else (flat,)
-    return max(float(((1 - share) * densities + share).clamp_min(1e-30).log().mean()) for share in shares)
+    return float(((1 - flat) * densities + flat).clamp_min(1e-30).log().mean())
 
 
-def fit_calibration(observations: Sequence[Observation]) -> Calibration:
+def fit_calibration(observations: Sequence[Observation], least_flat: float = 0.0) -> Calibration:
     """The temperature with the highest likelihood of the truth, then factors that make 90% ellipsoids hold.
 
     A factor is kept only where it brings the coverages at 50, 90 and 95% nearer to their names.
+
+    Args:
+        observations: Held-out scans.
+        least_flat: Of the shares of the uniform distribution, the least that may be.
     """
-    temperature = _maximise(lambda t: log_likelihood(observations, t), *TEMPERATURES)
-    flat = max(FLAT_SHARES, key=lambda share: log_likelihood(observations, temperature, share))
+    shares = [share for share in FLAT_SHARES if share >= least_flat]
+
+    def best(temperature: float) -> tuple[float, float]:
+        return max((log_likelihood(observations, temperature, share), share) for share in shares)
+
+    temperature = _maximise(lambda t: best(t)[0], *TEMPERATURES)
+    flat = best(temperature)[1]
     calibration = Calibration(temperature, translation_sigma=_translation_sigma(observations), flat=flat)
     pair_squares, rotation_squares, _ = _mahalanobis_squares(observations, calibration)
     return replace(calibration, pair_spread=_spread(pair_squares), rotation_spread=_spread(rotation_squares))

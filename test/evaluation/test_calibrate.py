@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from relpose_ros.evaluation.calibrate import VIEWS, _scans, calibrate, calibration_table
+from relpose_ros.evaluation.calibrate import LEAST_FLAT, VIEWS, _scans, calibrate, calibration_table
 from relpose_ros.evaluation.protocol import EvaluationError, PosedViews
 from relpose_ros.geometry.cameras import look_at, translation_of
 from relpose_ros.inference.calibration import Calibration
@@ -56,6 +56,7 @@ def test_a_sure_and_ignorant_network_becomes_modest(overconfident, tmp_path):
     assert before.log_likelihood < -1
     assert after.log_likelihood > before.log_likelihood + 1
     assert after.log_likelihood > -0.3
+    assert calibration.flat >= LEAST_FLAT
     assert "noise" in calibration_table(reports)
 
     metadata = read_metadata(output)
