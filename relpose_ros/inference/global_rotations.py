@@ -24,8 +24,6 @@ from relpose_ros.geometry import so3, so3_grid
 from relpose_ros.inference.pair_distribution import ascend, peaks, pick, uphill
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from relpose_ros.inference.pair_distribution import PairDistributions
     from relpose_ros.inference.pair_energies import PairEnergies
 
@@ -58,7 +56,7 @@ class AscentSettings:
     jumpers: int = 2
     """Solutions whose cameras may leave for another hill, one by one and two by two."""
     hops: int = 24
-    """Places considered for a single camera, the best by what the coarse grid remembers, in any scan."""
+    """Places considered for a single camera, the best by what the coarse grid remembers."""
     hills: int = 2
     """The best of them, which climb before they are compared."""
     hop_stride: float = math.radians(3)
@@ -68,8 +66,6 @@ class AscentSettings:
     """Times that any two cameras join anew, while that gains anything."""
     joining: int = 2
     """Partial solutions kept while two cameras join anew."""
-    hope: float = 0.3
-    """Nats a pair: a solution that is further below the best is neither refined nor polished."""
     finalists: int = 2
     """Solutions that are refined."""
     turns: float = 0.4
@@ -77,13 +73,13 @@ class AscentSettings:
     radii: tuple[float, ...] = tuple(math.radians(a) for a in (12, 6, 3))
     """Neighbourhood of each sweep over their cameras, rad."""
     winners: int = 4
-    """Solutions that are polished at the end, at most; one for a full scan."""
+    """Solutions that are polished at the end, and"""
+    polishes: int = 5
+    """how many times; both are one for a full scan."""
     last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (10, 6, 4, 3, 2, 1, 0.5, 0.2, 0.08))
-    """Neighbourhood of each sweep of that, rad."""
+    """Neighbourhood of each of those sweeps, rad."""
     distinct: float = math.radians(10)
     """Solutions are different where some camera differs by more, rad."""
-    same: float = math.radians(3)
-    """One that was tried is not tried again from nearer than this, rad."""
 
     def many(self, count: float, pairs: int) -> int:
         """A number of solutions for so many pairs: the fewer these are, the less a solution costs."""
@@ -121,22 +117,25 @@ def solve(
         # One beam favours what its first pairs agree on: each camera's turn as the root has another order.
         more = _grown(energies, distributions, list(range(1, energies.views)), settings)
         found, _ = _climbed(energies, torch.cat([found, grown, more]), count, settings)
-        best, scores = _left(
-            energies,
-            (found, joint_scores(energies, found)),
-            lambda each: _jumped(energies, distributions, each, tops, settings),
-            settings.jumps,
-            settings,
-        )
+        best, scores = found, joint_scores(energies, found)
+        for _ in range(settings.jumps):
+            before = scores[0]
+            jumped = _jumped(energies, distributions, best[:jumpers], tops, settings)
+            best, scores = _climbed(energies, torch.cat([best, jumped]), jumpers, settings)
+            if scores[0] <= before:
+                break
         if ceiling - scores[0] > settings.torn * energies.count:
             best = _refined(energies, distributions, best, scores, settings)
         # All may end on one hill: where they started is kept beside, for a runner-up to be told.
         found, _ = _best(energies, torch.cat([best, found]), count, settings.distinct)
-    winners = found[: min(settings.winners, settings.many(1, energies.count))]
-    winners = _promising(winners, joint_scores(energies, winners), settings.hope * energies.count)
-    for radius in settings.last_radii:
-        winners = _swept(energies, winners, radius)
-    return JointSolutions(*_best(energies, torch.cat([winners, found]), count, settings.distinct))
+    last, polishes = (
+        min(most, settings.many(1, energies.count)) for most in (settings.winners, settings.polishes)
+    )
+    winners = found[:last]
+    for turn in range(polishes):
+        for radius in settings.last_radii:
+            winners = _swept(energies, winners, radius, float(turn))
+    return JointSolutions(*_best(energies, torch.cat([winners, found[last:]]), count, settings.distinct))
 
 
 def _refined(
@@ -147,17 +146,17 @@ def _refined(
     settings: AscentSettings,
 ) -> torch.Tensor:
     """Solutions with any two cameras joined anew, the best of them refined. -> (<= S, N, 3, 3)."""
-    finalists, turns, rounds = (
-        settings.many(each, energies.count) for each in (settings.finalists, settings.turns, settings.rounds)
+    jumpers, finalists, turns, rounds = (
+        settings.many(each, energies.count)
+        for each in (settings.jumpers, settings.finalists, settings.turns, settings.rounds)
     )
-    best, scores = _left(
-        energies,
-        (best, scores),
-        lambda each: _rejoined(energies, distributions, each, settings),
-        rounds,
-        settings,
-    )
-    best = _promising(best[:finalists], scores[:finalists], settings.hope * energies.count)
+    for _ in range(rounds):
+        before = scores[0]
+        joined = _rejoined(energies, distributions, best, settings)
+        best, scores = _climbed(energies, torch.cat([best, joined]), jumpers, settings)
+        if scores[0] <= before:
+            break
+    best = best[:finalists]
     for turn in range(turns):
         for radius in settings.radii:
             best = _swept(energies, best, radius, float(turn))
@@ -171,55 +170,6 @@ def _climbed(
     rotations, _ = _best(energies, rotations, count, settings.distinct)
     rotations = _climb(energies, rotations, settings.climb_stride, settings.climb_steps)
     return _best(energies, rotations, count, settings.distinct)
-
-
-def _left(
-    energies: PairEnergies,
-    known: tuple[torch.Tensor, torch.Tensor],
-    leave: Callable[[torch.Tensor], torch.Tensor],
-    times: int,
-    settings: AscentSettings,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """The best distinct ones of solutions and of where `leave` takes them, climbed; best first.
-
-    Again while that gains anything. No solution is left twice, and none climbs twice: once tried, there is
-    hardly anything more to be found from it, and most solutions of one round are those of the last.
-
-    Args:
-        energies: of the scan.
-        known: Solutions (S, N, 3, 3) that climbed, and their scores (S,), best first.
-        leave: (S, N, 3, 3) -> (B, N, 3, 3).
-        times: at most.
-        settings: how many solutions leave.
-    """
-    best, scores = known
-    count = settings.many(settings.jumpers, energies.count)
-    tried = best[:0]
-    for _ in range(times):
-        fresh = _unlike(best[:count], tried, settings.same)
-        if not len(fresh):
-            break
-        tried = torch.cat([tried, fresh])
-        before, climbed = scores[0], best
-        best, scores = _best(energies, torch.cat([best, leave(fresh)]), count, settings.distinct)
-        new = _unlike(best, climbed, settings.same)
-        if len(new):
-            new = _climb(energies, new, settings.climb_stride, settings.climb_steps)
-            best, scores = _best(energies, torch.cat([best, new]), count, settings.distinct)
-        if scores[0] <= before:
-            break
-    return best, scores
-
-
-def _promising(rotations: torch.Tensor, scores: torch.Tensor, hope: float) -> torch.Tensor:
-    """Those solutions that are at most ``hope`` nats below the best."""
-    return rotations[scores >= scores.max() - hope]
-
-
-def _unlike(rotations: torch.Tensor, others: torch.Tensor, angle: float) -> torch.Tensor:
-    """Those solutions of which some camera differs from each of the others by more than ``angle``."""
-    traces = torch.einsum("snab,tnab->stn", rotations, others).amin(2)
-    return rotations[(traces <= 1 + 2 * math.cos(angle)).all(1)]
 
 
 def _climb(energies: PairEnergies, rotations: torch.Tensor, stride: float, steps: int) -> torch.Tensor:
@@ -455,7 +405,7 @@ def _jumped(
     modes = _mode_candidates(energies, distributions.modes, every, cameras, others)
     places = torch.cat([modes, cells.expand(*every.shape[:2], -1, -1, -1)], 2)
     guesses = _remembered(energies, distributions, every, cameras, others, places)
-    places = _highest(places, guesses, settings.hops, settings.distinct)
+    places = _highest(places, guesses, settings.many(settings.hops, energies.count), settings.distinct)
     gains = _conditional(energies, every, cameras, others, places)
     starts = _highest(places, gains, settings.many(settings.hills, energies.count), settings.distinct)
 
