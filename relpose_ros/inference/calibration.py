@@ -150,10 +150,18 @@ def log_likelihood(observations: Sequence[Observation], temperature: float, flat
         temperature: By which energies are divided.
         flat: Share of the uniform distribution.
     """
+    return _mean_log(_densities(observations, temperature), flat)
+
+
+def _densities(observations: Sequence[Observation], temperature: float) -> torch.Tensor:
+    """The network's own density of the truth relative to uniform, of all pairs. -> (P,)."""
     parts = [
         o.energy_at_truth / temperature - o.distributions.log_normaliser(temperature) for o in observations
     ]
-    densities = torch.cat(parts).exp()
+    return torch.cat(parts).exp()
+
+
+def _mean_log(densities: torch.Tensor, flat: float) -> float:
     return float(((1 - flat) * densities + flat).clamp_min(1e-30).log().mean())
 
 
@@ -169,7 +177,8 @@ def fit_calibration(observations: Sequence[Observation], least_flat: float = 0.0
     shares = [share for share in FLAT_SHARES if share >= least_flat]
 
     def best(temperature: float) -> tuple[float, float]:
-        return max((log_likelihood(observations, temperature, share), share) for share in shares)
+        densities = _densities(observations, temperature)
+        return max((_mean_log(densities, share), share) for share in shares)
 
     temperature = _maximise(lambda t: best(t)[0], *TEMPERATURES)
     flat = best(temperature)[1]
