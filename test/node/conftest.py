@@ -107,6 +107,11 @@ class NodeProcess:
         assert self.process.stdout is not None
         self.lines.extend(iter(self.process.stdout.readline, ""))
 
+    @property
+    def log(self) -> str:
+        """All of it in one text, which pytest shows whole."""
+        return "".join(list(self.lines))
+
     def told(self, *words: str) -> list[str]:
         """The lines that hold all the words."""
         return [line for line in list(self.lines) if all(word in line for word in words)]
@@ -115,7 +120,7 @@ class NodeProcess:
         def line() -> list[str]:
             found = self.told(*words)
             if not found and self.process.poll() is not None:
-                pytest.fail(f"the node ended with {self.process.returncode}: {list(self.lines)}")
+                pytest.fail(f"the node ended with {self.process.returncode}:\n{self.log}")
             return found
 
         return wait_until(line, f"a line with {words}")[0]

@@ -27,7 +27,7 @@ def test_a_signal_while_waiting(how: signal.Signals, start_without_network: Call
     node = start_without_network()
     node.wait_for("Waiting for views")
     assert node.end(how) == 0
-    assert not node.told("Traceback"), list(node.lines)
+    assert not node.told("Traceback"), node.log
 
 
 @BOTH
@@ -35,7 +35,7 @@ def test_a_signal_while_loading(how: signal.Signals, start_without_network: Call
     node = start_without_network(loading_s=FOR_EVER_S)
     node.wait_for("loading")
     assert node.end(how) == 0
-    assert not node.told("Traceback"), list(node.lines)
+    assert not node.told("Traceback"), node.log
 
 
 @BOTH
@@ -47,7 +47,7 @@ def test_a_signal_during_an_estimate(
     new_graph.publish("/object_view", *(make.object_view(10.0 + k, "mug") for k in range(2)))
     node.wait_for("estimating")
     assert node.end(how) == 0
-    assert not node.told("Traceback"), list(node.lines)
+    assert not node.told("Traceback"), node.log
 
 
 def test_a_clock_that_jumps_back_resets_the_scans(
@@ -105,7 +105,7 @@ def test_a_qos_override_that_cannot_be_is_told(
 ) -> None:
     node = start_without_network(f"qos_overrides./image.subscription.{override}")
     node.wait_for("ERROR", "The qos_overrides given are refused")
-    assert not node.told("Traceback"), list(node.lines)
+    assert not node.told("Traceback"), node.log
     assert "qos_overrides" in new_graph.diagnostics().message
     assert new_graph.state() == "unconfigured"
     assert new_graph.node.count_publishers("/scan_node/estimate") == 0, "what was made is released"
@@ -128,8 +128,8 @@ def test_a_misspelt_parameter_is_told(
         ("max_view", "max_views"),
         ("qos_overrides./image.subscription.depht", "qos_overrides./image.subscription.depth"),
     ):
-        assert node.told("WARN", f"no parameter {given} (did you mean {meant}?)"), list(node.lines)
-    assert len(node.told("no parameter")) == 3, list(node.lines)
+        assert node.told("WARN", f"no parameter {given} (did you mean {meant}?)"), node.log
+    assert len(node.told("no parameter")) == 3, node.log
     assert "no parameter" in new_graph.diagnostics().message
     assert node.end() == 0
 

@@ -59,9 +59,9 @@ def test_images_are_as_reliable_as_their_publishers(
     new_graph.publish(IMAGE, make.image(200.0))
     new_graph.wait_until(lambda: new_graph.count(IMAGE, "received") == received + 1, "another image")
     assert new_graph.diagnostic("object views") == "5"
-    assert not node.told("WARN", "reliability"), list(node.lines)
+    assert not node.told("WARN", "reliability"), node.log
     assert node.end() == 0
-    assert not node.told("A callback failed"), list(node.lines)
+    assert not node.told("A callback failed"), node.log
 
 
 def test_an_override_of_the_reliability_stays(

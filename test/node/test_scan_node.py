@@ -194,7 +194,7 @@ def test_garbage_in_between_costs_nothing(node: Any, graph: Any, make: Any) -> N
     assert [stamp_s(camera) for camera in estimate.cameras] == [10.0, 12.0]
     graph.wait_until(lambda: graph.count(OBJECT_VIEW, "rejected") == rejected + 6, "six rejections")
     for stamp in ("11.000", "11.100", "11.200", "11.300", "11.400", "9.500"):
-        assert node.told("WARN", OBJECT_VIEW, stamp), (stamp, list(node.lines))
+        assert node.told("WARN", OBJECT_VIEW, stamp), (stamp, node.log)
 
 
 def test_the_same_garbage_again_and_again_is_told_once(node: Any, graph: Any, make: Any) -> None:
@@ -365,4 +365,4 @@ def test_transitions(node: Any, graph: Any, make: Any, tmp_path: Path) -> None:
 def test_it_leaves_with_zero_whatever_it_does(running: Any, graph: Any, make: Any) -> None:
     graph.publish(OBJECT_VIEW, *(make.object_view(100.0 + k, "mug") for k in range(8)))
     assert running.end() == 0
-    assert not running.told("Traceback"), list(running.lines)
+    assert not running.told("Traceback"), running.log
