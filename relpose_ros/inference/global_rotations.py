@@ -75,7 +75,9 @@ class AscentSettings:
     winners: int = 4
     """Solutions that are polished at the end, and"""
     polishes: int = 5
-    """how many times; both are one for a full scan."""
+    """how many times at most; both are one for a full scan."""
+    settled: float = 1e-4
+    """Nats: where a polish gains less, another one would gain no more."""
     last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (10, 6, 4, 3, 2, 1, 0.5, 0.2, 0.08))
     """Neighbourhood of each of those sweeps, rad."""
     distinct: float = math.radians(10)
@@ -133,8 +135,11 @@ def solve(
     )
     winners = found[:last]
     for turn in range(polishes):
+        before = joint_scores(energies, winners)
         for radius in settings.last_radii:
             winners = _swept(energies, winners, radius, float(turn))
+        if (joint_scores(energies, winners) - before).max() < settings.settled:
+            break
     return JointSolutions(*_best(energies, torch.cat([winners, found[last:]]), count, settings.distinct))
 
 
