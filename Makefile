@@ -24,7 +24,7 @@ demo: setup
 	@echo "Open $(CURDIR)/out/demo/report.html in a browser."
 
 test: lint
-	$(BIN)/python -m pytest --cov --cov-report=term
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --cov --cov-report=term
 
 lint: setup
 	$(BIN)/ruff check .

@@ -21,7 +21,7 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 """Material that does not belong in the repository; a fresh clone elsewhere has none."""
 
 # Before torch is imported: more threads than cores make small tensors slower, not faster.
-os.environ.setdefault("OMP_NUM_THREADS", "2")
+os.environ.setdefault("OMP_NUM_THREADS", "1" if "PYTEST_XDIST_WORKER" in os.environ else "2")
 os.environ.setdefault("GOMP_SPINCOUNT", cli.SPINS)
 
 # The same examples each time, and no deadline: how loaded a machine is must not decide whether a test passes.

@@ -48,8 +48,8 @@ def observations(scene_type, count, temperature, seed):
 @pytest.fixture(scope="module")
 def overconfident(fisher_scene_type):
     """Energies three times as sharp as they should be."""
-    return observations(fisher_scene_type[0], 150, 3.0, seed=0), observations(
-        fisher_scene_type[0], 150, 3.0, seed=1
+    return observations(fisher_scene_type[0], 100, 3.0, seed=0), observations(
+        fisher_scene_type[0], 100, 3.0, seed=1
     )
 
 
@@ -71,7 +71,7 @@ def test_calibration_holds_on_scans_it_was_not_fitted_on(overconfident):
 
 
 def test_well_calibrated_energies_are_left_alone(fisher_scene_type):
-    calibration = fit_calibration(observations(fisher_scene_type[0], 120, 1.0, seed=2))
+    calibration = fit_calibration(observations(fisher_scene_type[0], 80, 1.0, seed=2))
     assert calibration.temperature == pytest.approx(1.0, rel=0.2)
     assert calibration.pair_spread == pytest.approx(1.0, abs=0.3)
 
