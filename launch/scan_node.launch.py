@@ -10,7 +10,7 @@ from launch_ros.actions import Node
 
 from launch import LaunchDescription
 
-INPUTS = ("object_view", "image", "camera_info")
+INPUTS = ("object_view", "image", "camera_info", "camera_pose", "camera_pose_with_covariance")
 
 
 def generate_launch_description() -> LaunchDescription:

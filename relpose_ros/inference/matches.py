@@ -110,7 +110,7 @@ class TwoViewGeometry:
 
     def agrees(self, rotation: FloatArray) -> bool:
         """Whether the best pose is trusted and has this rotation: then its points and direction count."""
-        if self.probability < TRUSTED:
+        if not self.poses or self.probability * self.poses[0].weight < TRUSTED:
             return False
         return bool(so3.angle_between(rotation, self.poses[0].rotation) < AGREEMENT)
 

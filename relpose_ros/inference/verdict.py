@@ -20,9 +20,6 @@ TRUSTED = 0.6
 """A pair is trusted when this much of its probability lies within 15 degrees of the final poses: more likely
 right than wrong with a margin, and impossible for a pair with two equal modes. A chain of pairs is trusted
 when the product of theirs is as much."""
-CHECKED = 2
-"""Trusted pairs that every camera needs: a single one, however sure, has nothing to be checked against, so
-that two views are never enough."""
 HARDLY_ANYTHING = 2
 """Percent within 15 degrees below which a number would claim more than is known; uniform has 0.1."""
 CONTRADICTION = math.radians(10)
@@ -50,10 +47,11 @@ def judge(
 ) -> tuple[Verdict, int, str]:
     """The verdict, the weakest pair's position and the verdict in words.
 
-    ENOUGH asks for four things: a trusted chain of pairs from every camera to the first; a second trusted
-    pair of every camera, by which the first is checked; a small covariance of every camera; and calibrated
-    probabilities, without which the others mean nothing. Views are named by their position in the scan, from
-    0, as in the messages.
+    ENOUGH asks for four things: a trusted chain of pairs from every camera to the first; that no camera and
+    no group of them hangs on a single pair, which nothing checks, so that two views are never enough; a small
+    covariance of every camera's rotation; and calibrated probabilities, without which the others mean
+    nothing. Of positions it asks nothing: their covariances say what is known. Views are named by their
+    position in the scan, from 0, as in the messages.
 
     Args:
         pairs: of all N views.
@@ -62,13 +60,13 @@ def judge(
     """
     deviations = rotation_deviations(covariances)
     tied = _tied(pairs, len(covariances))
-    trusted = [pair for pair in pairs if pair.solution_probability >= TRUSTED]
-    ties = np.bincount([view for pair in trusted for view in (pair.i, pair.j)], minlength=len(covariances))
-    if all(tied) and ties.min() < CHECKED:
-        camera = int(ties.argmin())
-        own = [p for p, pair in enumerate(pairs) if camera in (pair.i, pair.j) and pair in trusted]
-        reason = f"view {camera} hangs on one pair, which no other pair checks"
-        return Verdict.ONE_MORE_VIEW, own[0], f"{ONE_MORE}{reason}"
+    trusted = [p for p, pair in enumerate(pairs) if pair.solution_probability >= TRUSTED]
+    if all(tied) and (unchecked := _unchecked(pairs, trusted)) is not None:
+        bridge, views = unchecked
+        hangs = f"view {views[0]} hangs" if len(views) == 1 else f"views {_listed(views)} hang"
+        pair = pairs[bridge]
+        reason = f"{hangs} on pair {pair.i}-{pair.j} alone, which no other pair checks"
+        return Verdict.ONE_MORE_VIEW, bridge, f"{ONE_MORE}{reason}"
     if all(tied) and deviations.max() <= LARGEST_DEVIATION:
         weakest = min(range(len(pairs)), key=lambda p: _certainty(pairs[p]))
         if calibrated:
@@ -140,6 +138,38 @@ def _chains(pairs: Sequence[PairRotation], views: int) -> list[list[int]]:
         old, new = (i, j) if chains[j] is None else (j, i)
         chains[new] = [*(chains[old] or []), best]
     return [chain or [] for chain in chains]
+
+
+def _unchecked(pairs: Sequence[PairRotation], trusted: Sequence[int]) -> tuple[int, list[int]] | None:
+    """A trusted pair without which the trusted ones tie not all views together, and the views of its far end.
+
+    The least certain of such pairs. Its far end is the smaller one; of two as large, the one without view 0.
+    """
+    found = []
+    for bridge in trusted:
+        near, far = (
+            _reached(view, [pairs[p] for p in trusted if p != bridge])
+            for view in (pairs[bridge].i, pairs[bridge].j)
+        )
+        if near.isdisjoint(far):
+            views = min(near, far, key=lambda each: (len(each), 0 in each))
+            found.append((_certainty(pairs[bridge]), bridge, sorted(views)))
+    return min(found)[1:] if found else None
+
+
+def _reached(view: int, pairs: Sequence[PairRotation]) -> set[int]:
+    """The views that pairs tie to one of them, with itself."""
+    reached, known = {view}, 0
+    while len(reached) > known:
+        known = len(reached)
+        for pair in pairs:
+            if pair.i in reached or pair.j in reached:
+                reached |= {pair.i, pair.j}
+    return reached
+
+
+def _listed(views: Sequence[int]) -> str:
+    return f"{', '.join(map(str, views[:-1]))} and {views[-1]}"
 
 
 def _tied(pairs: Sequence[PairRotation], views: int) -> list[bool]:

@@ -237,12 +237,7 @@ class ScanNode(LifecycleNode):
         ):
             service = self.create_service(Trigger, name, callback, callback_group=group)
             self._services_of_scan.append(service)
-        threshold = JumpThreshold(
-            min_forward=None,
-            min_backward=Duration(seconds=-self._settings.backward_jump_s),
-            on_clock_change=False,
-        )
-        self._jump = self.get_clock().create_jump_callback(threshold, post_callback=self._on_clock_jump)
+        self._watch_clock()
         return super().on_configure(state)
 
     @_guarded
@@ -290,6 +285,16 @@ class ScanNode(LifecycleNode):
     def _load_estimator(self) -> Estimator:
         self.get_logger().info(f"Loading {self._settings.weights_path or 'the shipped weights'}.")
         return self._settings.load_estimator()
+
+    def _watch_clock(self) -> None:
+        if self._jump is not None:
+            self._jump.unregister()
+        threshold = JumpThreshold(
+            min_forward=None,
+            min_backward=Duration(seconds=-self._settings.backward_jump_s),
+            on_clock_change=False,
+        )
+        self._jump = self.get_clock().create_jump_callback(threshold, post_callback=self._on_clock_jump)
 
     def _make_outputs(self) -> None:
         for name, message_type in OUTPUTS:
@@ -398,7 +403,7 @@ class ScanNode(LifecycleNode):
             return
         started = time.perf_counter()
         receipt = scanner.receive(kind, topic, message)
-        if receipt.accepted:
+        if receipt.accepted or scanner.pending():  # a view without a place has a failed estimate tried again
             self._ask_for_estimate()
         if receipt.rejected:
             line = self._throttle.pass_on(topic, receipt.reason)
@@ -578,6 +583,8 @@ class ScanNode(LifecycleNode):
         self._settings = changed_settings(old, parameters)
         if self._scanner is not None and self._settings != old:
             self._scanner.change_settings(self._settings)
+            if self._settings.backward_jump_s != old.backward_jump_s:
+                self._watch_clock()
             if self._active:  # fewer views may be left, or other evidence counts
                 self._ask_for_estimate()
         if old.diagnostics_period_s != self._settings.diagnostics_period_s:

@@ -231,9 +231,7 @@ class ScanBuffer:
     def _take(self, view: View, topic: str) -> Decision:
         """Take a view that no other is newer than."""
         self._note_time(view.stamp_ns, view.frame_id, topic)
-        # A newcomer on trial would wait for ever for the estimate that failed.
-        self._changed |= self._failed
-        self._failed = False
+        self._try_again()
         full = len(self._views) >= self._settings.max_views
         if full and self._settings.keep == "first":
             return self._decline_further(view.stamp_ns, view.frame_id, topic)
@@ -250,8 +248,14 @@ class ScanBuffer:
         self._changed, self._base = True, None
         return Decision(True)
 
+    def _try_again(self) -> None:
+        """Have an estimate that failed made again: what is held, or on trial, would wait for it for ever."""
+        self._changed |= self._failed
+        self._failed = False
+
     def _decline_further(self, stamp_ns: int, frame_id: str, topic: str) -> Decision:
         self._note_time(stamp_ns, frame_id, topic)
+        self._try_again()
         self._decline()
         text = f"the scan of {self.object_id!r} has its {len(self._views)} views"
         if self._is_paused(stamp_ns):

@@ -252,6 +252,8 @@ def test_only_trusted_matches_with_the_cameras_rotation_count():
     assert geometry.agrees(so3.exp([0, math.radians(9), 0]))
     assert not geometry.agrees(so3.exp([0, math.radians(11), 0]))
     assert not replace(geometry, probability=0.4).agrees(np.eye(3))
+    turned = pose(so3.exp([0, 1.0, 0]), 0.5)
+    assert not replace(geometry, poses=(pose(np.eye(3), 0.5), turned)).agrees(np.eye(3)), "of two, either"
 
 
 def test_the_chance_of_a_rotation_is_that_of_the_poses_about_it():

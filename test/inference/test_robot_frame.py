@@ -157,6 +157,17 @@ def test_poses_that_contradict_each_other_tell_nothing():
     )
 
 
+@pytest.mark.parametrize("jitter", [0.0, 0.001])
+def test_a_camera_that_the_robot_held_still_tells_no_scale(jitter):
+    """As before a turntable: nothing contradicts anything."""
+    rotations, centres = around(4, 5)
+    offsets = jitter * np.random.default_rng(0).standard_normal((4, 3))
+    poses = [RobotPose("base", np.eye(3), np.array([0.1, 0.2, 0.3]) + offset, ARM) for offset in offsets]
+    assert find_robot_frame(rotations, centres, spread(4), poses) == (
+        "the camera stood in one place, as far as the robot's camera poses tell"
+    )
+
+
 def test_baselines_too_short_against_their_uncertainty():
     rotations, centres = around(3, 1)
     near = [0, 0, -1] + 0.02 * centres

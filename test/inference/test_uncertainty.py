@@ -249,11 +249,27 @@ def test_a_pair_that_nothing_checks_is_not_enough(fisher_scene, cameras_around):
     verdict, weakest, words = judge(pairs, covariances, calibrated=True)
     assert verdict is Verdict.ONE_MORE_VIEW
     assert weakest == 0
-    assert words == "one more view: view 0 hangs on one pair, which no other pair checks"
+    assert words == "one more view: view 1 hangs on pair 0-1 alone, which no other pair checks"
     scene = fisher_scene(cameras_around(3, 8), concentration=300.0)
     scene.mixtures[0, 2] = [(np.eye(3), 0.0, 0.0)]
     pairs, covariances, _ = told(scene)
     assert judge(pairs, covariances, calibrated=True)[0] is Verdict.ONE_MORE_VIEW
+
+
+def test_two_groups_that_one_pair_ties_are_not_enough(fisher_scene, cameras_around):
+    """Every view has two sure pairs, and yet half of them may be turned by what the one pair is wrong by."""
+    scene = fisher_scene(cameras_around(6, 8), concentration=300.0)
+    for i, j in itertools.product(range(3), range(3, 6)):
+        if (i, j) != (2, 3):
+            scene.mixtures[i, j] = [(np.eye(3), 0.0, 0.0)]
+    pairs, covariances, _ = told(scene)
+    verdict, weakest, words = judge(pairs, covariances, calibrated=True)
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert (pairs[weakest].i, pairs[weakest].j) == (2, 3)
+    assert words == "one more view: views 3, 4 and 5 hang on pair 2-3 alone, which no other pair checks"
+    scene.mixtures[1, 4] = [(scene.relative(1, 4), 0.0, 300.0)]
+    pairs, covariances, _ = told(scene)
+    assert judge(pairs, covariances, calibrated=True)[0] is Verdict.ENOUGH
 
 
 def test_contradicting_pairs_are_not_enough(fisher_scene, cameras_around):

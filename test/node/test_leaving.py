@@ -71,6 +71,13 @@ def test_a_clock_that_jumps_back_resets_the_scans(
     new_graph.set_clock(50)
     node.wait_for("the clock jumped backwards by 50.000 s")
     new_graph.wait_until(lambda: new_graph.diagnostic("mug views") is None, "a scan that is forgotten")
+    assert new_graph.set_parameter("backward_jump_s", 20.0)[0]
+    new_graph.publish("/object_view", *(make.object_view(50.0 + k, "mug") for k in range(2)))
+    new_graph.wait_until(lambda: new_graph.diagnostic("mug views") == "2", "a scan that begins anew")
+    new_graph.set_clock(40)
+    new_graph.set_clock(10)
+    node.wait_for("the clock jumped backwards by 30.000 s")
+    assert not node.told("the clock jumped backwards by 10.000 s"), node.log
 
     new_graph.node.create_publisher(
         Image, "/image", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

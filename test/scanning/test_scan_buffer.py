@@ -385,6 +385,20 @@ def test_a_failed_estimate_is_tried_again_with_the_next_view() -> None:
     assert retried.views == work.views
 
 
+def test_a_failed_estimate_of_a_full_scan_is_tried_again_with_a_view_that_finds_no_place() -> None:
+    buffer = buffer_with(1, 2, keep="first", max_views=2)
+    work = buffer.work()
+    assert work is not None
+    buffer.give_up(work)
+    assert not buffer.has_work()
+    declined = buffer.declines(3 * SECOND, "camera", "/image")
+    assert declined is not None
+    assert not declined.accepted
+    retried = buffer.work()
+    assert retried is not None
+    assert retried.views == work.views
+
+
 def test_a_trial_that_fails_leaves_the_views_as_they_are(circle_estimator: Callable[..., Any]) -> None:
     buffer = buffer_with(1, 2, keep="spread", max_views=2)
     estimate_all(buffer, circle_estimator())
