@@ -44,7 +44,7 @@ class BoundingBox:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Pinhole intrinsics of the full, rectified image, in pixels (corner convention, see above)."""
+    """Pinhole intrinsics of the full image, in pixels (corner convention, see above)."""
 
     fx: float
     fy: float
@@ -56,6 +56,16 @@ class Intrinsics:
         """What to assume of a camera that said nothing but the size of its image, pixels."""
         focal = GUESSED_FOCAL * max(width, height)
         return cls(focal, focal, width / 2, height / 2)
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """How a lens bends the rays of a picture that nobody rectified: OpenCV's models, as in CameraInfo."""
+
+    coefficients: tuple[float, ...]
+    """k1, k2, p1, p2 and so on, for rays (x / z, y / z)."""
+    equidistant: bool = False
+    """Whether they are k1 to k4 of the fisheye model (Kannala and Brandt 2006)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +92,8 @@ class View:
     """The camera's optical frame (REP-103: x right, y down, z forward)."""
     intrinsics: Intrinsics | None = None
     """None where the camera said nothing."""
+    distortion: Distortion | None = None
+    """None of a rectified picture; ``intrinsics`` are there where it is not None."""
     mask: npt.NDArray[np.bool_] | None = None
     """(H, W), True on the object; None where nobody segmented it."""
 

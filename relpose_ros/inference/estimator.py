@@ -339,7 +339,8 @@ class Estimator:
         if refined is None:
             return rotations, placed, placed_joint
         # The directions between cameras that moved are told by the points, and better.
-        settled, settled_joint = settle(refined, joint)
+        guessed = any(view.intrinsics is None for view in scan.views)
+        settled, settled_joint = settle(refined, joint, guessed=guessed)
         others = [camera for camera in range(len(rotations)) if camera not in refined.moved]
         left = [each for each in baselines if each.i in others or each.j in others]
         settled[others] = centres[others]

@@ -19,7 +19,7 @@ from relpose_ros.views import Intrinsics
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from relpose_ros.views import View
+    from relpose_ros.views import Distortion, View
 
     FloatArray = npt.NDArray[np.float64]
     IntArray = npt.NDArray[np.int64]
@@ -66,6 +66,8 @@ class LocalFeatures:
     """A pixel of the picture in which they were found, in units of ``rays``: the scale of their accuracy."""
     guessed: bool
     """Whether the intrinsics are a guess."""
+    unbounded: bool = False
+    """Whether neither box nor mask tells the object from what stands around it, although they should."""
 
 
 def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
@@ -100,9 +102,15 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
     pixels += [left + view.origin[0], top + view.origin[1]]
     intrinsics = view.intrinsics or Intrinsics.guessed(view.full_width, view.full_height)
     focal = np.array([intrinsics.fx, intrinsics.fy])
-    rays = (pixels - [intrinsics.cx, intrinsics.cy]) / focal
+    rays = _straightened((pixels - [intrinsics.cx, intrinsics.cy]) / focal, view.distortion)
     pixel = 1 / (scale * float(focal.mean()))
-    return LocalFeatures(rays, orientations, descriptors, places, plain, pixel, view.intrinsics is None)
+    box = view.box
+    full = box.x0 <= 0 and box.y0 <= 0 and box.x1 >= view.full_width and box.y1 >= view.full_height
+    return LocalFeatures(
+        *(rays, orientations, descriptors, places, plain, pixel),
+        guessed=view.intrinsics is None,
+        unbounded=full and view.mask is None and not surroundings,
+    )
 
 
 def match(first: LocalFeatures, second: LocalFeatures) -> IntArray:
@@ -165,6 +173,16 @@ def _detect(grey: Any, region: Any, most: int) -> tuple[FloatArray, FloatArray, 
     # OpenCV's (0, 0) is the first pixel's centre.
     places = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5
     return places, np.radians([point.angle for point in points]), descriptors
+
+
+def _straightened(rays: FloatArray, distortion: Distortion | None) -> FloatArray:
+    """Rays (K, 2) as they were before the lens bent them."""
+    import cv2
+
+    if distortion is None or len(rays) == 0:
+        return rays
+    undo: Any = cv2.fisheye.undistortPoints if distortion.equidistant else cv2.undistortPoints
+    return np.asarray(undo(rays[:, None], np.eye(3), np.array(distortion.coefficients))[:, 0], np.float64)
 
 
 def _squeezed(grey: Any, region: Any) -> tuple[Any, Any]:

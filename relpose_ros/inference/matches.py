@@ -138,6 +138,11 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> tuple[tuple[Relative
     None where there are too few matches, or too few that any pose explains.
     """
     matches = match(first, second)
+    if first.unbounded and second.unbounded:
+        # Before a camera that stands still an object that turns moves, and what is around it does not. What
+        # stays where it was tells little in any other case.
+        shifts = np.linalg.norm(second.rays[matches[:, 1]] - first.rays[matches[:, 0]], axis=1)
+        matches = matches[shifts > THRESHOLD * math.sqrt(first.pixel * second.pixel)]
     if len(matches) < LEAST_MATCHES:
         return None
     # Of one object seen twice they do (weak geometric consistency: Jegou et al. 2008).
@@ -269,10 +274,21 @@ def _with_covariances(
     )
 
 
+def guessed_focal_covariance(turn: FloatArray) -> FloatArray:
+    """What a guessed focal length adds to the covariance of a rotation: an error in proportion to the angle.
+
+    Args:
+        turn: (3,) the rotation vector.
+
+    Returns:
+        (3, 3) rad^2.
+    """
+    return (GUESSED_FOCAL_DEVIATION / 2) ** 2 * (np.outer(turn, turn) + float(turn @ turn) * np.eye(3) / 4)
+
+
 def _widened(pose: RelativePose) -> RelativePose:
-    """With what a guessed focal length adds: an error in proportion to the angle turned."""
-    turn = so3.log(pose.rotation)
-    along = (GUESSED_FOCAL_DEVIATION / 2) ** 2 * (np.outer(turn, turn) + float(turn @ turn) * np.eye(3) / 4)
+    """With what a guessed focal length adds."""
+    along = guessed_focal_covariance(so3.log(pose.rotation))
     spread = GUESSED_FOCAL_DEVIATION**2 * (np.eye(3) - np.outer(pose.direction, pose.direction)) / 4
     return replace(
         pose,

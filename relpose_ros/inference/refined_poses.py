@@ -12,7 +12,7 @@ import numpy as np
 
 from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.camera_positions import rows_of
-from relpose_ros.inference.matches import FLOOR, WIDENING
+from relpose_ros.inference.matches import FLOOR, WIDENING, guessed_focal_covariance
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,7 +31,7 @@ STEP = 1e-6
 """Of the numeric derivative of the frame by the poses."""
 
 
-def settle(refined: Refined, joint: FloatArray) -> tuple[FloatArray, FloatArray]:
+def settle(refined: Refined, joint: FloatArray, *, guessed: bool = False) -> tuple[FloatArray, FloatArray]:
     """Centres and joint covariance after a bundle adjustment, in the frame of the estimate.
 
     What the points tell joins what was known before, widened as a pair's matches are: errors of features near
@@ -42,6 +42,8 @@ def settle(refined: Refined, joint: FloatArray) -> tuple[FloatArray, FloatArray]
     Args:
         refined: The adjustment's poses and what its points tell.
         joint: (6 N, 6 N) covariance before.
+        guessed: Whether a focal length was guessed. Points cannot tell: through a wrong one they fit poses
+            that go around the object by more or less.
 
     Returns:
         (N, 3) and (6 N, 6 N).
@@ -72,6 +74,10 @@ def settle(refined: Refined, joint: FloatArray) -> tuple[FloatArray, FloatArray]
         spread[own[:3], own[:3]] += FLOOR**2 * float(centres[camera] @ centres[camera])
         if camera != 0:  # whose axes are the frame's
             spread[own[3:], own[3:]] += FLOOR**2
+        if guessed:
+            around = np.concatenate([-so3.hat(centres[camera]), np.eye(3)])  # a turn about the object
+            turned = guessed_focal_covariance(so3.log(rotations[camera]))
+            spread[np.ix_(own, own)] += around @ turned @ around.T
     settled = joint.copy()
     settled[rows] = 0
     settled[:, rows] = 0

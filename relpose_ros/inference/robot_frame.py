@@ -94,19 +94,19 @@ def find_robot_frame(
     cameras = [k for k in told if np.linalg.eigvalsh(turns[k])[-1] < UNKNOWN**2]
     if len(cameras) < 2:
         return "of the views whose camera pose is known, less than two are tied to the others"
-    if _in_one_place([pose for k in cameras if (pose := poses[k]) is not None]):
-        return "the camera stood in one place, as far as the robot's camera poses tell"
     problem = _Problem(rotations, centres, covariance, poses)
     for chosen in _majorities(cameras):
         fits = [fit for subset in chosen if (fit := problem.fit(subset)) is not None]
         agreeing = [fit for fit in fits if fit.misfit < CONTRADICTION]
         if agreeing:
             return _told(min(agreeing, key=lambda fit: fit.misfit), frame)
+    if _in_one_place([pose for k in cameras if (pose := poses[k]) is not None]):
+        return "the camera stood in one place, as far as the robot's camera poses tell"
     return "the robot's camera poses contradict the ones that were found"
 
 
 def _in_one_place(poses: Sequence[RobotPose]) -> bool:
-    """Whether the positions differ by no more than their own deviations, as of a camera before a turntable."""
+    """Whether the positions differ by no more than their deviations, as of a camera before a turntable."""
     positions = np.stack([pose.position for pose in poses])
     apart_by = np.square(positions - positions.mean(0)).sum()
     return bool(apart_by <= sum(np.trace(pose.covariance[:3, :3]) for pose in poses))

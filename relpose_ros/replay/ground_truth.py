@@ -145,6 +145,7 @@ def _views(records: Iterable[Record], inputs: Mapping[str, Input]) -> Iterator[t
                 continue
             for pair in pairing.add(entry.kind, Arrival(record.message, source), entry.camera):
                 image, info = pair.image, pair.info
-                yield settings.object_id, view_from_image(image.message, info.message, image.source)
+                view = view_from_image(image.message, info.message, image.source, settings.rectification)
+                yield settings.object_id, view
         except ViewError as err:
             logger.warning("Left out: %s", err)

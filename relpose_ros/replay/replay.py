@@ -17,6 +17,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from relpose_ros.errors import RelPoseError
+from relpose_ros.estimates import Evidence
 from relpose_ros.geometry import so3
 from relpose_ros.replay.bags import BagReader, BagWriter, choose_inputs
 from relpose_ros.replay.ground_truth import of_one_camera, read_true_poses
@@ -232,9 +233,9 @@ def scan_json(recording: Recording) -> str:
     """The recording as JSON.
 
     ``views`` of an estimate are positions in the top-level ``views``; ``view``, ``i`` and ``j`` below it are
-    positions in the estimate's own ``views``, as in the messages. Matrices are flat and row-major, with the
-    units and frames of the messages; boxes are [left, top, right, bottom] in pixels of the full image, (0, 0)
-    being the outer corner of its first pixel.
+    positions in the estimate's own ``views``, as in the messages, and ``weakest_pair`` one in its ``pairs``.
+    Matrices are flat and row-major, with the units and frames of the messages; boxes are [left, top, right,
+    bottom] in pixels of the full image, (0, 0) being the outer corner of its first pixel.
     """
     views = [_view_json(index, view) for index, view in enumerate(recording.views)]
     estimates = [_estimate_json(each) for each in recording.estimates]
@@ -259,6 +260,10 @@ def _estimate_json(record: EstimateRecord) -> dict[str, Any]:
     estimate = record.estimate
     return {
         "views": list(record.views),
+        "verdict": estimate.verdict.name,
+        "calibrated": bool(estimate.calibrated),
+        "weakest_pair": int(estimate.weakest_pair),
+        "score": float(estimate.score),
         "scale_known": bool(estimate.scale_known),
         "scale_deviation": float(estimate.scale_deviation),
         "object_pose": None if estimate.object_pose is None else _object_pose_json(estimate.object_pose),
@@ -295,6 +300,10 @@ def _pair_json(pair: PairRotation) -> dict[str, Any]:
         "probability_within_15_deg": float(pair.probability_within_15_deg),
         "entropy": float(pair.entropy),
         "ambiguous": bool(pair.ambiguous),
+        "ambiguity_angle": float(pair.ambiguity_angle),
+        "solution_probability": float(pair.solution_probability),
+        "solution_angle": float(pair.solution_angle),
+        "evidence": [each.name for each in Evidence if each in pair.evidence],
         "modes": [_mode_json(mode) for mode in pair.modes],
     }
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,7 +18,7 @@ from relpose_ros.errors import RelPoseError
 from relpose_ros.scanning import image_decoding
 from relpose_ros.scanning.image_decoding import ImageError, Region
 from relpose_ros.scanning.settings import MAX_NAME_LENGTH
-from relpose_ros.views import BoundingBox, Intrinsics, RobotPose, View
+from relpose_ros.views import BoundingBox, Distortion, Intrinsics, RobotPose, View
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -69,6 +69,10 @@ class _Picture:
     @property
     def size(self) -> tuple[int, int]:
         return self.width, self.height
+
+
+DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
+"""By the names of sensor_msgs/distortion_models.hpp, how many numbers each may have."""
 
 
 def stamp_text(stamp_ns: int) -> str:
@@ -124,16 +128,18 @@ def view_from_object_view(message: Any, source: Source) -> View:
         return _view(picture, origin, box, full, _intrinsics(message.k, source), decode_mask, source)
 
 
-def view_from_image(image: Any, info: Any, source: Source) -> View:
+def view_from_image(image: Any, info: Any, source: Source, rectification: str = "auto") -> View:
     """The view in a sensor_msgs/Image or CompressedImage and the CameraInfo of the same stamp.
 
     The box is the camera info's roi; an roi of zeros is the full image. As in image_pipeline, the picture
-    shows the full image or the roi alone: its size tells which.
+    shows the full image or the roi alone: its size tells which. One camera info serves the raw picture (K
+    and D) and the rectified one (P).
 
     Args:
         image: The picture.
         info: Its camera info.
         source: Where and when ``image`` was taken.
+        rectification: "raw", "rectified", or "auto": rectified where the topic has "rect" in its name.
 
     Raises:
         ViewError: A field is wrong, or two of them contradict each other.
@@ -157,7 +163,13 @@ def view_from_image(image: Any, info: Any, source: Source) -> View:
         else:
             text = f"the picture has {_size_text(picture.size)} pixels: neither the {_size_text(full)} of "
             raise source.rejection(f"{text}camera_info nor the {box.width:.0f} x {box.height:.0f} of its roi")
-        return _view(picture, origin, box, full, _intrinsics(info.k, source), None, source)
+        rectified = rectification == "rectified" or (rectification == "auto" and "rect" in source.topic)
+        if rectified and any(info.p):
+            intrinsics, distortion = _intrinsics(np.reshape(info.p, (3, 4))[:, :3].ravel(), source), None
+        else:
+            intrinsics = _intrinsics(info.k, source)
+            distortion = None if rectified or intrinsics is None else _distortion(info, source)
+        return replace(_view(picture, origin, box, full, intrinsics, None, source), distortion=distortion)
 
 
 def robot_pose(message: Any, source: Source, deviations: tuple[float, float]) -> RobotPose:
@@ -308,6 +320,23 @@ def _intrinsics(k: Any, source: Source) -> Intrinsics | None:
         raise source.rejection(f"the focal length in the intrinsic matrix is {fx}, {fy}: it must be positive")
     # ROS puts (0, 0) at the first pixel's centre, we at its outer corner.
     return Intrinsics(fx, fy, cx + 0.5, cy + 0.5)
+
+
+def _distortion(info: Any, source: Source) -> Distortion | None:
+    """Of a camera info; None where the lens bends nothing."""
+    coefficients, model = np.asarray(info.d, np.float64), str(info.distortion_model)
+    if not np.isfinite(coefficients).all():
+        raise source.rejection(f"the distortion d holds what is no number: {coefficients.tolist()}")
+    if not coefficients.any():
+        return None
+    lengths = DISTORTION_MODELS.get(model)
+    if lengths is None:
+        text = f"the distortion_model is {model[:40]!r}, none of {', '.join(DISTORTION_MODELS)}"
+        raise source.rejection(f"{text}: send rectified pictures, with parameter rectification: rectified")
+    if len(coefficients) not in lengths:
+        text = f"the {model} distortion d has {len(coefficients)} numbers: give {lengths[-1]}"
+        raise source.rejection(text)
+    return Distortion(tuple(coefficients.tolist()), equidistant=model == "equidistant")
 
 
 def _check_name(name: str, what: str, source: Source) -> None:

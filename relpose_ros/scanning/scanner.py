@@ -359,12 +359,12 @@ class Scanner:
 
     def _offer_pair(self, pair: ImagePair) -> Receipt:
         image, info = pair.image, pair.info
-        topics = (image.source.topic, info.source.topic)
+        topics, rectification = (image.source.topic, info.source.topic), self._settings.rectification
         try:
             return self._offer(
                 self._settings.object_id,
                 image.source,
-                lambda: view_from_image(image.message, info.message, image.source),
+                lambda: view_from_image(image.message, info.message, image.source, rectification),
                 topics,
             )
         except ViewError as err:

@@ -104,6 +104,13 @@ class ScanSettings:
         choices=("raw", "compressed"),
         fixed=True,
     )
+    rectification: str = _setting(
+        "auto",
+        "What the pictures on image are. raw: as the lens bends them, by K and D of camera_info. rectified: "
+        "straightened, by its P. auto: rectified where the topic has rect in its name, as image_proc calls "
+        "them.",
+        choices=("auto", "raw", "rectified"),
+    )
     weights: str = _setting(
         "",
         "Path of a weights file, where ~ is the home folder; empty: the compact weights that ship with the "

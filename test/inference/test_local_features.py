@@ -15,7 +15,7 @@ from relpose_ros.inference.local_features import (
     match,
 )
 from relpose_ros.inference.matches import NOTHING, relate
-from relpose_ros.views import BoundingBox, Intrinsics, View
+from relpose_ros.views import BoundingBox, Distortion, Intrinsics, View
 
 
 def pixels(features, view):
@@ -171,6 +171,38 @@ def test_without_intrinsics_the_focal_length_is_guessed(textured):
     known = find_features(replace(view, intrinsics=Intrinsics(240, 240, 100, 80)))
     assert not known.guessed
     np.testing.assert_allclose(known.rays, features.rays)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "bend"),
+    [
+        (
+            Distortion((-0.3, 0.1, 0.002, -0.001, 0.0)),
+            lambda rays, d: cv2.projectPoints(
+                np.concatenate([rays, np.ones((len(rays), 1))], 1)[:, None],
+                *(np.zeros(3), np.zeros(3), np.eye(3), d),
+            )[0],
+        ),
+        (
+            Distortion((0.1, -0.02, 0.003, 0.0), equidistant=True),
+            lambda rays, d: cv2.fisheye.distortPoints(rays[:, None], np.eye(3), d),
+        ),
+    ],
+)
+def test_rays_are_straightened_where_a_lens_bent_them(textured, distortion, bend):
+    view = textured(0, intrinsics=Intrinsics(240, 240, 100, 80))
+    bent, straight = (find_features(each).rays for each in (view, replace(view, distortion=distortion)))
+    assert np.abs(bent - straight).max() > 0.005
+    np.testing.assert_allclose(bend(straight, np.array(distortion.coefficients))[:, 0], bent, atol=1e-4)
+
+
+def test_a_box_or_a_mask_bounds_the_object(textured):
+    whole = BoundingBox(0, 0, 200, 160)
+    view = replace(textured(0), box=whole)
+    assert find_features(view).unbounded
+    assert not find_features(view, surroundings=True).unbounded, "they are asked for"
+    assert not find_features(replace(view, box=replace(whole, x0=10))).unbounded
+    assert not find_features(replace(view, mask=np.ones(view.image.shape[:2], bool))).unbounded
 
 
 def test_a_surface_at_a_slant_matches(textured):

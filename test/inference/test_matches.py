@@ -208,6 +208,18 @@ def test_a_static_background_takes_no_part(ball_on_a_turntable, rotation_of_ball
     assert degrees(misled.poses[0].rotation, np.eye(3)) < 3
 
 
+def test_without_a_box_what_stays_in_place_says_nothing(ball_on_a_turntable, rotation_of_ball):
+    """A camera info without a region of interest: the box is the picture, and most of it does not turn."""
+    views = [ball_on_a_turntable(turn, masked=False) for turn in (0, 20)]
+    whole = BoundingBox(0, 0, views[0].full_width, views[0].full_height)
+    found = relate(*(find_features(replace(view, box=whole)) for view in views))
+    truth = rotation_of_ball(20) @ rotation_of_ball(0).T
+    assert found.probability > 0.9
+    assert degrees(found.poses[0].rotation, truth) < 3
+    same = relate(*(find_features(replace(views[0], box=whole)) for _ in range(2)))
+    assert same.probability == 0, "of a picture taken twice nobody knows whether anything moved"
+
+
 # Trust, and what becomes of it.
 
 

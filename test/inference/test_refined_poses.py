@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +52,36 @@ def test_the_origin_is_where_the_axes_meet_and_the_first_camera_at_distance_one(
     np.testing.assert_allclose(cameras.closest_point_to_axes(refined.rotations, centres), 0, atol=1e-9)
     assert np.linalg.norm(centres[0]) == pytest.approx(1)
     assert np.linalg.norm(centres - true_centres(scene), axis=1).max() < 0.02
+
+
+class Stretched:
+    """A scene whose rays were worked out with a wrong focal length."""
+
+    def __init__(self, scene, factor):
+        self._scene, self._factor = scene, factor
+
+    def __getattr__(self, name):
+        return getattr(self._scene, name)
+
+    def features(self, **settings):
+        return [replace(each, rays=self._factor * each.rays) for each in self._scene.features(**settings)]
+
+
+@pytest.mark.parametrize("angles", [[0.0, 15, 30], ANGLES, [0.0, 25, 50, 75, 100]])
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_a_guessed_focal_length_that_is_wrong_is_allowed_for(angles, factor, point_scene):
+    """Of one so wrong the errors are those of one standard deviation."""
+    known, guessed = [], []
+    for seed in range(4):
+        scene = Stretched(point_scene.ring(angles, seed=seed), factor)
+        refined = adjusted(scene, seed=seed)
+        for errors, guess in ((known, False), (guessed, True)):
+            _, joint = settle(refined, before(len(angles)), guessed=guess)
+            for camera, covariance in enumerate(apart(joint)[1:, 3:, 3:], start=1):
+                turn = so3.log(scene.rotations[camera].T @ refined.rotations[camera])
+                errors.append(turn @ np.linalg.solve(covariance, turn))
+    assert np.mean(guessed) < 4
+    assert np.mean(known) > 3 * np.mean(guessed)
 
 
 def test_errors_are_within_what_is_stated_and_that_is_less_than_before(point_scene):

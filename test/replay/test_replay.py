@@ -70,8 +70,15 @@ def test_one_estimate_for_each_view_from_the_second_on(
     assert [each["views"] for each in scan["estimates"]] == [list(range(n)) for n in (2, 3, 4, 5)]
     for estimate in scan["estimates"]:
         assert set(estimate) == {
-            *("views", "scale_known", "scale_deviation", "object_pose", "status", "cameras", "pairs")
+            *("views", "verdict", "calibrated", "weakest_pair", "score", "status", "cameras", "pairs"),
+            *("scale_known", "scale_deviation", "object_pose"),
         }
+        enough = len(estimate["views"]) > 2
+        assert (estimate["verdict"], estimate["calibrated"]) == (
+            "ENOUGH" if enough else "ONE_MORE_VIEW",
+            False,
+        )
+        assert estimate["weakest_pair"] < len(estimate["pairs"])
         assert (estimate["scale_deviation"], estimate["object_pose"]) == (0.0, None)
         count = len(estimate["views"])
         assert [camera["view"] for camera in estimate["cameras"]] == list(range(count))
@@ -84,8 +91,10 @@ def test_one_estimate_for_each_view_from_the_second_on(
         for pair in estimate["pairs"]:
             assert set(pair) == {
                 *("i", "j", "orientation_xyzw", "covariance", "probability_within_15_deg"),
-                *("entropy", "ambiguous", "modes"),
+                *("entropy", "ambiguous", "ambiguity_angle", "solution_probability", "solution_angle"),
+                *("evidence", "modes"),
             }
+            assert pair["evidence"] == ["LEARNED"]
             assert len(pair["covariance"]) == 9
             for mode in pair["modes"]:
                 assert set(mode) == {"orientation_xyzw", "weight", "covariance"}

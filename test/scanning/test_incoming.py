@@ -19,7 +19,7 @@ from relpose_ros.scanning.incoming import (
     view_from_image,
     view_from_object_view,
 )
-from relpose_ros.views import BoundingBox, Intrinsics
+from relpose_ros.views import BoundingBox, Distortion, Intrinsics
 
 NAN = float("nan")
 
@@ -205,6 +205,48 @@ def test_the_roi_of_a_camera_info_is_the_box(
     height, width = view.image.shape[:2]
     x, y = (origin[0] - roi[0], origin[1] - roi[1]) if size != (40, 32) else origin
     np.testing.assert_array_equal(view.image, pixels[y : y + height, x : x + width])
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectification", "bent"),
+    [
+        ("/camera/image_raw", "auto", True),
+        ("/camera/image_rect_color/compressed", "auto", False),
+        ("/camera/image_rect", "raw", True),
+        ("/camera/image_raw", "rectified", False),
+    ],
+)
+def test_a_raw_picture_has_the_lens_s_distortion_and_a_rectified_one_a_matrix_of_its_own(
+    messages: Any, topic: str, rectification: str, bent: bool
+) -> None:
+    image, info = messages.rgb(picture()), messages.camera_info(40, 32)
+    info.d[0] = -0.3
+    info.p[:] = [400, 0, 20, 0, 0, 410, 16, 0, 0, 0, 1, 0]
+    view = view_from_image(image, info, source_of(image, topic), rectification)
+    if bent:
+        assert view.intrinsics == Intrinsics(500.0, 500.0, 320.5, 240.5)
+        assert view.distortion == Distortion((-0.3, 0.0, 0.0, 0.0, 0.0))
+    else:
+        assert view.intrinsics == Intrinsics(400.0, 410.0, 20.5, 16.5)
+        assert view.distortion is None
+
+
+def test_a_straight_lens_and_an_unknown_camera_have_no_distortion(messages: Any) -> None:
+    assert view_of_pair(messages.rgb(picture()), messages.camera_info(40, 32)).distortion is None
+    info = messages.camera_info(40, 32, k=(0,) * 9)
+    info.d[0] = 0.1
+    assert view_of_pair(messages.rgb(picture()), info).distortion is None
+
+
+@pytest.mark.parametrize(
+    ("model", "first", "said"),
+    [("plumb_bob", NAN, "no number"), ("omni", 0.1, "'omni'"), ("equidistant", 0.1, "5 numbers: give 4")],
+)
+def test_a_distortion_that_is_none_is_rejected(messages: Any, model: str, first: float, said: str) -> None:
+    info = messages.camera_info(40, 32)
+    info.distortion_model, info.d[0] = model, first
+    with pytest.raises(ViewError, match=said):
+        view_of_pair(messages.rgb(picture()), info)
 
 
 def test_an_uncalibrated_camera_needs_no_size(messages: Any) -> None:
