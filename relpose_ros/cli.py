@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from relpose_ros.errors import RelPoseError
 from relpose_ros.network.presets import PRESETS, VARIANTS
+from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -132,8 +133,9 @@ def _parser() -> argparse.ArgumentParser:
         "--method",
         action="append",
         metavar="NAME",
-        help="relpose, relpose-known, both, learned, geometry, constant-translation, identity or colmap; "
-        "again for more (default: all)",
+        help="relpose (as it ships), relpose-known (its known cameras alone), both (network and matches, not "
+        "refined), learned (the network alone), geometry (the matches alone), constant-translation, identity "
+        "or colmap; again for more (default: all)",
     )
     evaluate.add_argument(
         "--variant",
@@ -393,8 +395,9 @@ def _view_counts(text: str) -> tuple[int, ...]:
         counts = tuple(range(int(first), int(last if dots else first) + 1))
     except ValueError:
         counts = ()
-    if not counts:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of views: write 5, or 2..8")
+    if not counts or counts[0] < MIN_VIEWS or counts[-1] > MAX_VIEWS:
+        text = f"{text!r} are no numbers of views from {MIN_VIEWS} to {MAX_VIEWS}: write 5, or 2..8"
+        raise argparse.ArgumentTypeError(text)
     return counts
 
 

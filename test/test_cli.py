@@ -83,12 +83,12 @@ def test_what_is_missing_is_named_in_one_sentence(arguments, named, tmp_path, mo
     assert "Traceback" not in printed
 
 
-@pytest.mark.parametrize("text", ["", "two", "5..2", "2..", "3.5"])
+@pytest.mark.parametrize("text", ["", "two", "5..2", "2..", "3.5", "9", "1..8"])
 def test_numbers_of_views_that_are_none(text, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(["evaluate", "capture", "--views", text])
     assert end.value.code == 2
-    assert "number of views" in capsys.readouterr().err
+    assert "numbers of views from 2 to 8" in capsys.readouterr().err
 
 
 def test_numbers_of_views():

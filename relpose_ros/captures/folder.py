@@ -136,7 +136,8 @@ def load_capture(folder: Path) -> Capture:
     folder = Path(folder)
     listing = folder / LISTING
     if not folder.is_dir():
-        text = f"{folder} is no folder; a capture is a folder with cameras.json and images/."
+        what = "is no folder" if folder.exists() else "does not exist"
+        text = f"{folder} {what}; a capture is a folder with cameras.json and images/."
         raise CaptureError(text)
     try:
         content = json.loads(listing.read_text(encoding="utf-8"))

@@ -31,7 +31,8 @@ NOT_ENOUGH = "not enough: "
 WITHOUT_ROOM = {
     "first": "the scan is full: drop_last_view makes room for another view, reset for all",
     "latest": "take one more view: it takes the place of the oldest",
-    "spread": "take one more view from a new direction: it takes the place of the view that tells least",
+    "spread": "drop_last_view makes room for a view near that pair, and one from a new direction takes the "
+    "place of the view that tells least",
 }
 """What to do where no more views are held, by the scan's policy of which ones stay."""
 

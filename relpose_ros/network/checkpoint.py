@@ -227,7 +227,7 @@ def _read_checkpoint(file: Path) -> Tensors:
     if kind is None and head.startswith(b"PK"):
         kind = _foreign_archive(file)
     elif kind is None and not head.startswith(b"\x80"):
-        kind = "no format that is known here"
+        kind = "of no format that is known"
     if kind is not None:
         raise NetworkFileError(f"The weights file '{file}' is {kind}; expected {_EXPECTED}.")
     try:

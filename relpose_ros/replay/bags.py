@@ -212,6 +212,9 @@ class BagReader:
         files = sorted(each for each in self.path.iterdir() if _storage_suffix(each) is not None)
         if not files:
             text = f"{self.path} is no bag: it holds neither a .mcap nor a .db3 file."
+            if (self.path / "cameras.json").exists():
+                how = f"'relpose_ros pack {self.path} --output BAG'"
+                text = f"{self.path} is a capture and no bag: {how} makes one of it."
             raise BagError(text)
         for file in files:
             self._open_file(file)

@@ -34,6 +34,7 @@ _MOST_STAGES = 8
 
 DRAWS = 20
 """How often another scan is drawn when one lacks views within the angle asked for."""
+HOW_TO_MAKE_SHARDS = "make some with 'relpose_ros render DIR --as shards'"
 
 
 class ShardError(RelPoseError):
@@ -51,7 +52,7 @@ class Scans:
                 looked at them.
         """
         if not shards:
-            text = "there are no shards to learn from; make some with 'relpose_ros render'."
+            text = f"there are no shards to learn from; {HOW_TO_MAKE_SHARDS}."
             raise ShardError(text)
         self.map_shapes = {
             stage: shards[0][MAP.format(stage)].shape[2:]
@@ -98,7 +99,11 @@ def open_scans(folders: Iterable[Path]) -> Scans:
     Raises:
         ShardError: as `Scans`.
     """
-    return Scans([read_shard(path) for path in shard_folders(folders)])
+    folders = list(folders)
+    shards = [read_shard(path) for path in shard_folders(folders)]
+    if not shards:
+        raise ShardError(f"there are no shards in {', '.join(map(str, folders))}; {HOW_TO_MAKE_SHARDS}.")
+    return Scans(shards)
 
 
 @dataclass(frozen=True)

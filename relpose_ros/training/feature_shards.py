@@ -15,7 +15,14 @@ import torch
 from tqdm import tqdm
 
 from relpose_ros.captures.shards import new_shard, read_shard, shard_folders
-from relpose_ros.training.batches import FIELDS, MAP, ShardError, augmented, normalised
+from relpose_ros.training.batches import (
+    FIELDS,
+    HOW_TO_MAKE_SHARDS,
+    MAP,
+    ShardError,
+    augmented,
+    normalised,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -64,7 +71,7 @@ def write_feature_shards(
         for path in shard_folders(folders)
     ]
     if not wanted:
-        text = f"there are no shards in {', '.join(map(str, folders))}; make some with 'relpose_ros render'."
+        text = f"there are no shards in {', '.join(map(str, folders))}; {HOW_TO_MAKE_SHARDS}."
         raise ShardError(text)
     names = Counter(name for name, _ in wanted)
     if doubled := [path for name, path in wanted if names[name] > 1]:

@@ -122,7 +122,7 @@ def test_a_listing_that_makes_no_sense_is_refused(tmp_path: Path, content: str, 
 
 
 def test_a_missing_folder_and_a_missing_listing_are_told_apart(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="no folder"):
+    with pytest.raises(CaptureError, match="does not exist"):
         load_capture(tmp_path / "nowhere")
     with pytest.raises(CaptureError, match=r"no cameras\.json"):
         load_capture(tmp_path)

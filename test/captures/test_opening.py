@@ -34,7 +34,7 @@ def test_a_category_gives_its_sequences_and_the_dataset_those_of_a_split(
 
 
 def test_what_is_nothing_of_the_kind_is_refused_in_a_sentence(tmp_path, write_category):
-    with pytest.raises(CaptureError, match="is no folder"):
+    with pytest.raises(CaptureError, match="does not exist; a capture is a folder"):
         names(tmp_path / "missing")
     with pytest.raises(
         CaptureError, match=r"neither a capture, which has cameras\.json, nor a folder of such, nor"

@@ -336,7 +336,7 @@ def test_foreign_files_are_called_by_their_name(tmp_path: Path) -> None:
     assert "a web page" in told(b"<!DOCTYPE html><html>")
     assert "git lfs pull" in told(b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n")
     assert "a PNG image" in told(b"\x89PNG\r\n\x1a\n" + bytes(50))
-    assert "no format that is known" in told(b"plain text")
+    assert "of no format that is known" in told(b"plain text")
     np.savez(tmp_path / "arrays.npz", a=np.zeros(3))
     assert "a NumPy archive" in refusal(tmp_path / "arrays.npz")
     torch.save([1, 2], file)

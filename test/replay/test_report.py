@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from relpose_ros.estimates import Mode, PairRotation, ScanEstimate, Verdict
 from relpose_ros.geometry import so3
+from relpose_ros.inference.verdict import WITHOUT_ROOM
 from relpose_ros.replay.pack import pack
 from relpose_ros.replay.recording import PICTURE_SIDE, Recording
 from relpose_ros.replay.replay import replay
@@ -97,7 +98,7 @@ def test_the_heading_asks_for_a_view_only_where_there_is_room(
     assert heading in page
     has_room = max_views > 5
     assert ("One more view needed" in page, "Not enough yet" in page) == (has_room, not has_room)
-    advice = "; take one more view from a new direction: it takes the place of the view that tells least."
+    advice = f"; {WITHOUT_ROOM['spread']}."
     assert f"<p>Pair 0-1 says hardly anything{'.' if has_room else advice}</p>" in page
 
 
