@@ -204,8 +204,10 @@ def test_enough_needs_trusted_pairs_and_calibrated_ones(fisher_scene, cameras_ar
         ("latest", "take one more view: it takes the place of the oldest"),
         (
             "spread",
-            "drop_last_view makes room for a view near that pair, "
-            + "and one from a new direction takes the place of the view that tells least",
+            (
+                "drop_last_view makes room for a view near that pair, "
+                "and one from a new direction takes the place of the view that tells least"
+            ),
         ),
     ],
 )
