@@ -14,7 +14,7 @@ import pytest
 from relpose_ros import cli
 from relpose_ros.captures.folder import Frame, save_capture
 from relpose_ros.geometry.cameras import look_at, translation_of
-from relpose_ros.network.checkpoint import random_network, read_metadata, write_network
+from relpose_ros.network.checkpoint import load_network, random_network, read_metadata, write_network
 from relpose_ros.network.presets import PRESETS, named_preset
 from relpose_ros.training.batches import open_scans
 from relpose_ros.views import BoundingBox, Intrinsics, View
@@ -225,6 +225,14 @@ def test_captures_become_shards(tmp_path, posed_capture):
     shards = tmp_path / "shards"
     assert cli.main(["shard", str(posed_capture.parent), "--output", str(shards), "--copies", "2"]) == 0
     assert len(open_scans([shards])) == 2
+    features = tmp_path / "features"
+    assert cli.main(["features", str(shards), "--output", str(features), "--plain"]) == 0
+    kept = open_scans([features])
+    assert len(kept) == 2
+    # What the network that ships would see of its crops.
+    network = load_network()
+    wanted = network.feature_extractor.summarised_shapes
+    assert {stage: kept.map_shapes[stage] for stage in wanted} == wanted
 
 
 def test_variants_masks_and_categories_of_co3d(tmp_path, write_category, capsys):
