@@ -2,8 +2,8 @@
 
     python -m benchmarks.arcs CAPTURE... [--views 3 4 6 8] [--masks]
 
-An arc begins at a photograph and goes on, each time, to the nearest one by its angle that is 15 degrees or more
-from all before it; it ends where none lies within 45 degrees. What is measured is the estimator as it ships.
+An arc begins at a photograph and goes on, each time, to the nearest one by its angle that is 15 degrees or
+more from all before it; it ends where none lies within 45 degrees. Measured is the estimator as it ships.
 """
 
 from __future__ import annotations
