@@ -7,6 +7,7 @@ key ``state_dict``; it is unpickled with ``weights_only``, so that it can hold d
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import pickle
@@ -331,6 +332,7 @@ def _guessed_preset(tensors: Tensors, file: Path) -> Preset:
     return PRESETS[best]
 
 
+@functools.lru_cache(maxsize=8)
 def _expected(preset: Preset) -> Tensors:
     """The state dict's names, shapes and types, without numbers."""
     with torch.device("meta"):
