@@ -6,6 +6,7 @@ Every refusal is a sentence that names the topic, the stamp and the value.
 from __future__ import annotations
 
 import math
+import re
 from collections import OrderedDict
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -74,6 +75,9 @@ class _Picture:
 DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """By the names of sensor_msgs/distortion_models.hpp, how many numbers each may have."""
 
+RECTIFIED_TOPIC = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
+"""As image_proc calls them: image_rect, image_rect_color."""
+
 
 def stamp_text(stamp_ns: int) -> str:
     """A stamp for a person, in seconds with all nine digits."""
@@ -139,7 +143,7 @@ def view_from_image(image: Any, info: Any, source: Source, rectification: str = 
         image: The picture.
         info: Its camera info.
         source: Where and when ``image`` was taken.
-        rectification: "raw", "rectified", or "auto": rectified where the topic has "rect" in its name.
+        rectification: "raw", "rectified", or "auto": as the topic's name says, see `RECTIFIED_TOPIC`.
 
     Raises:
         ViewError: A field is wrong, or two of them contradict each other.
@@ -163,7 +167,8 @@ def view_from_image(image: Any, info: Any, source: Source, rectification: str = 
         else:
             text = f"the picture has {_size_text(picture.size)} pixels: neither the {_size_text(full)} of "
             raise source.rejection(f"{text}camera_info nor the {box.width:.0f} x {box.height:.0f} of its roi")
-        rectified = rectification == "rectified" or (rectification == "auto" and "rect" in source.topic)
+        named = RECTIFIED_TOPIC.search(source.topic) is not None
+        rectified = rectification == "rectified" or (rectification == "auto" and named)
         if rectified and any(info.p):
             intrinsics, distortion = _intrinsics(np.reshape(info.p, (3, 4))[:, :3].ravel(), source), None
         else:

@@ -212,6 +212,7 @@ def test_the_roi_of_a_camera_info_is_the_box(
     [
         ("/camera/image_raw", "auto", True),
         ("/camera/image_rect_color/compressed", "auto", False),
+        ("/cam_direct/image_raw", "auto", True),
         ("/camera/image_rect", "raw", True),
         ("/camera/image_raw", "rectified", False),
     ],
