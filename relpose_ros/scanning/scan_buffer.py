@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from relpose_ros.estimates import Verdict
 from relpose_ros.scanning.incoming import stamp_text
 from relpose_ros.views import MIN_VIEWS
 
@@ -182,7 +183,8 @@ class ScanBuffer:
 
         Returns:
             Whether it is one of this scan: not of views that were forgotten meanwhile, nor with a newcomer
-            that the scan does not take.
+            that the scan does not take. It takes one that looks from a newer direction than the view that it
+            replaces, unless the views held are enough and would be no more.
         """
         if work.epoch != self._epoch:
             return False
@@ -193,7 +195,8 @@ class ScanBuffer:
         self._on_trial = None
         before = nearest_angles(viewing_directions(self._base)).min()
         after = nearest_angles(viewing_directions(estimate))[-1]
-        if not after > before + SPREAD_MARGIN:
+        undoes = self._base.verdict is Verdict.ENOUGH and estimate.verdict is not Verdict.ENOUGH
+        if undoes or not after > before + SPREAD_MARGIN:
             self._decline()
             self._pause(work.newcomer.stamp_ns)
             return False

@@ -77,7 +77,7 @@ class ScanSettings:
         "Which views stay when more than max_views arrive. first: the earliest, so that frame and set change "
         "no more. latest: the newest, for an object that is moved now and then; the frame moves on "
         "with the oldest view. spread: the first, which sets the frame, and those that look from directions "
-        "furthest apart, for an orbit of many frames.",
+        "furthest apart, for an orbit of many frames; where these are enough, none that would undo it.",
         choices=("first", "latest", "spread"),
     )
     max_scans: int = _setting(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from relpose_ros.estimates import Verdict
 from relpose_ros.scanning.scan_buffer import (
     Decision,
     ScanBuffer,
@@ -371,6 +373,27 @@ def test_views_that_come_while_an_estimate_is_made_are_taken_together(
     assert following is not None
     assert [each.stamp_ns // SECOND for each in following.views] == [1, 2, 3, 4, 5]
     assert buffer.work() is None
+
+
+@pytest.mark.parametrize("enough_before", [True, False])
+def test_a_scan_that_is_enough_declines_a_view_that_would_undo_it(
+    enough_before: bool, circle_estimator: Callable[..., Any]
+) -> None:
+    """A view from a new direction may take the place of the one that tied the others."""
+    circle = circle_estimator()
+
+    class Verdicts:
+        def estimate(self, scan: Scan) -> Any:
+            undone = any(view.stamp_ns > 10 * SECOND for view in scan.views) or not enough_before
+            verdict = Verdict.ONE_MORE_VIEW if undone else Verdict.ENOUGH
+            return replace(circle.estimate(scan), verdict=verdict)
+
+    buffer = buffer_with(1, 2, 3, keep="spread", max_views=3)
+    assert estimate_all(buffer, Verdicts()) == [True]
+    add(buffer, 19)
+    assert estimate_all(buffer, Verdicts()) == [not enough_before]
+    assert stamps_of(buffer) == ([1, 2, 3] if enough_before else [1, 3, 19])
+    assert buffer.declined == (1 if enough_before else 0)
 
 
 def test_a_failed_estimate_is_tried_again_with_the_next_view() -> None:
