@@ -17,10 +17,10 @@ from tqdm import tqdm
 
 from relpose_ros.captures.opening import open_captures
 from relpose_ros.evaluation import metrics, trust
+from relpose_ros.evaluation.baselines import Estimated
 from relpose_ros.evaluation.protocol import posed_views
 from relpose_ros.geometry import so3
 from relpose_ros.inference.estimator import Estimator
-from relpose_ros.views import Scan
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -45,11 +45,8 @@ def arcs(rotations: FloatArray, views: int) -> list[list[int]]:
             arc.append(int(np.where(free, angles[arc[-1]], np.inf).argmin()))
         if len(arc) == views:
             found.append(arc)
-    return (
-        [found[k] for k in np.unique(np.linspace(0, len(found) - 1, ARCS).round().astype(int))]
-        if found
-        else []
-    )
+    kept = np.linspace(0, len(found) - 1, min(ARCS, len(found))).round().astype(int)
+    return [found[k] for k in kept]
 
 
 def main() -> None:
@@ -63,7 +60,7 @@ def main() -> None:
     if not arguments.captures:
         print("Nothing to measure: name captures with poses.")
         return
-    estimator = Estimator.from_weights()
+    method = Estimated("relpose", Estimator.from_weights())
     print(
         "rotation @5 and @15 of pairs; scans called enough, and of these with a pair more than 15 degrees off"
     )
@@ -74,18 +71,15 @@ def main() -> None:
         sequence = posed_views(capture, masked=arguments.masks)
         poses = sequence.camera_from_world
         # The same views in all arcs: an estimator matches a pair once.
-        held = {k: sequence.view(k) for k in range(len(poses))}
+        held = [sequence.view(k) for k in range(len(poses))]
         for views in arguments.views:
             measured = []
             for arc in tqdm(arcs(poses[:, :, :3], views), desc=f"{capture.name}, N = {views}", leave=False):
-                estimate = estimator.estimate(Scan(capture.name, tuple(held[k] for k in arc)))
-                rotations = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
-                measured.append(
-                    (
-                        metrics.rotation_errors(rotations, poses[arc, :, :3]),
-                        trust.statements(estimate, poses[arc, :, :3], poses[arc, :, 3]),
-                    )
-                )
+                found = method.poses([held[k] for k in arc])
+                assert found.estimate is not None
+                rotations, translations = poses[arc, :, :3], poses[arc, :, 3]
+                errors = metrics.rotation_errors(found.rotations, rotations)
+                measured.append((errors, trust.statements(found.estimate, rotations, translations)))
             show(capture.name, views, measured)
             totals[views] += measured
     for views, measured in totals.items():

@@ -129,17 +129,18 @@ def solve(
         if ceiling - scores[0] > settings.torn * energies.count:
             best = _refined(energies, distributions, best, scores, settings)
         # All may end on one hill: where they started is kept beside, for a runner-up to be told.
-        found, _ = _best(energies, torch.cat([best, found]), count, settings.distinct)
+        found, scores = _best(energies, torch.cat([best, found]), count, settings.distinct)
     last, polishes = (
         min(most, settings.many(1, energies.count)) for most in (settings.winners, settings.polishes)
     )
-    winners = found[:last]
+    winners, scores = found[:last], scores[:last]
     for turn in range(polishes):
-        before = joint_scores(energies, winners)
+        if turn > 0:
+            before, scores = scores, joint_scores(energies, winners)
+            if (scores - before).max() < settings.settled:
+                break
         for radius in settings.last_radii:
             winners = _swept(energies, winners, radius, float(turn))
-        if (joint_scores(energies, winners) - before).max() < settings.settled:
-            break
     return JointSolutions(*_best(energies, torch.cat([winners, found[last:]]), count, settings.distinct))
 
 

@@ -148,11 +148,10 @@ def _unchecked(pairs: Sequence[PairRotation], trusted: Sequence[int]) -> tuple[i
     """
     found = []
     for bridge in trusted:
-        near, far = (
-            _reached(view, [pairs[p] for p in trusted if p != bridge])
-            for view in (pairs[bridge].i, pairs[bridge].j)
-        )
-        if near.isdisjoint(far):
+        others = [pairs[p] for p in trusted if p != bridge]
+        near = _reached(pairs[bridge].i, others)
+        if pairs[bridge].j not in near:
+            far = _reached(pairs[bridge].j, others)
             views = min(near, far, key=lambda each: (len(each), 0 in each))
             found.append((_certainty(pairs[bridge]), bridge, sorted(views)))
     return min(found)[1:] if found else None

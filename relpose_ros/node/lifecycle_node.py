@@ -403,7 +403,7 @@ class ScanNode(LifecycleNode):
             return
         started = time.perf_counter()
         receipt = scanner.receive(kind, topic, message)
-        if receipt.accepted or scanner.pending():  # a view without a place has a failed estimate tried again
+        if scanner.pending():
             self._ask_for_estimate()
         if receipt.rejected:
             line = self._throttle.pass_on(topic, receipt.reason)

@@ -117,7 +117,8 @@ class ScanBuffer:
             )
         full = len(self._views) >= self._settings.max_views
         if full and (self._settings.keep == "first" or self._is_paused(stamp_ns)):
-            return self._decline_further(stamp_ns, frame_id, topic)
+            self._note_arrival(stamp_ns, frame_id, topic)
+            return self._decline_further(stamp_ns)
         return None
 
     def add(self, view: View, topic: str) -> Decision:
@@ -233,11 +234,10 @@ class ScanBuffer:
 
     def _take(self, view: View, topic: str) -> Decision:
         """Take a view that no other is newer than."""
-        self._note_time(view.stamp_ns, view.frame_id, topic)
-        self._try_again()
+        self._note_arrival(view.stamp_ns, view.frame_id, topic)
         full = len(self._views) >= self._settings.max_views
         if full and self._settings.keep == "first":
-            return self._decline_further(view.stamp_ns, view.frame_id, topic)
+            return self._decline_further(view.stamp_ns)
         if full and self._settings.keep == "spread":
             self._candidates.append(view)
             if len(self._candidates) > self._settings.max_views:
@@ -251,14 +251,7 @@ class ScanBuffer:
         self._changed, self._base = True, None
         return Decision(True)
 
-    def _try_again(self) -> None:
-        """Have an estimate that failed made again: what is held, or on trial, would wait for it for ever."""
-        self._changed |= self._failed
-        self._failed = False
-
-    def _decline_further(self, stamp_ns: int, frame_id: str, topic: str) -> Decision:
-        self._note_time(stamp_ns, frame_id, topic)
-        self._try_again()
+    def _decline_further(self, stamp_ns: int) -> Decision:
         self._decline()
         text = f"the scan of {self.object_id!r} has its {len(self._views)} views"
         if self._is_paused(stamp_ns):
@@ -269,11 +262,14 @@ class ScanBuffer:
         self.dropped += 1
         self.declined += 1
 
-    def _note_time(self, stamp_ns: int, frame_id: str, topic: str) -> None:
+    def _note_arrival(self, stamp_ns: int, frame_id: str, topic: str) -> None:
         """Time goes on in this topic: whatever lay far behind was garbage."""
         self._seen.append((stamp_ns, frame_id, topic))
         self._newest_on[topic] = stamp_ns
         self._suspects.pop(topic, None)
+        # What is held, or a newcomer on trial, would wait for ever for an estimate that failed.
+        self._changed |= self._failed
+        self._failed = False
 
     def _pause(self, stamp_ns: int) -> None:
         """Try no newcomer for a while after one that gained nothing."""

@@ -34,7 +34,7 @@ _MOST_STAGES = 8
 
 DRAWS = 20
 """How often another scan is drawn when one lacks views within the angle asked for."""
-HOW_TO_MAKE_SHARDS = "make some with 'relpose_ros render DIR --as shards'"
+_HOW_TO_MAKE_SHARDS = "make some with 'relpose_ros render DIR --as shards'"
 
 
 class ShardError(RelPoseError):
@@ -52,7 +52,7 @@ class Scans:
                 looked at them.
         """
         if not shards:
-            text = f"there are no shards to learn from; {HOW_TO_MAKE_SHARDS}."
+            text = f"there are no shards to learn from; {_HOW_TO_MAKE_SHARDS}."
             raise ShardError(text)
         self.map_shapes = {
             stage: shards[0][MAP.format(stage)].shape[2:]
@@ -93,17 +93,25 @@ class Scans:
         return {name: self._shards[shard][name][within] for name in self._fields}
 
 
+def shards_in(folders: Sequence[Path]) -> list[Path]:
+    """The folders of all shards under the given ones, in order of their names.
+
+    Raises:
+        ShardError: There are none.
+    """
+    found = shard_folders(folders)
+    if not found:
+        raise ShardError(f"there are no shards in {', '.join(map(str, folders))}; {_HOW_TO_MAKE_SHARDS}.")
+    return found
+
+
 def open_scans(folders: Iterable[Path]) -> Scans:
     """All shards under the given folders, memory-mapped, in order of their names.
 
     Raises:
         ShardError: as `Scans`.
     """
-    folders = list(folders)
-    shards = [read_shard(path) for path in shard_folders(folders)]
-    if not shards:
-        raise ShardError(f"there are no shards in {', '.join(map(str, folders))}; {HOW_TO_MAKE_SHARDS}.")
-    return Scans(shards)
+    return Scans([read_shard(path) for path in shards_in(list(folders))])
 
 
 @dataclass(frozen=True)

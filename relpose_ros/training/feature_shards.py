@@ -14,15 +14,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from relpose_ros.captures.shards import new_shard, read_shard, shard_folders
-from relpose_ros.training.batches import (
-    FIELDS,
-    HOW_TO_MAKE_SHARDS,
-    MAP,
-    ShardError,
-    augmented,
-    normalised,
-)
+from relpose_ros.captures.shards import new_shard, read_shard
+from relpose_ros.training.batches import FIELDS, MAP, ShardError, augmented, normalised, shards_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -64,15 +57,8 @@ def write_feature_shards(
     if copies < 1 or (copies > 1 and augmentation is None):
         text = f"{copies} copies cannot be made; ask for 1 or more, and for 1 of scans as they are."
         raise ShardError(text)
-    folders = [source.resolve() for source in sources]
-    wanted = [
-        (f"{path.parent.name}-{path.name}-{copy}", path)
-        for copy in range(copies)
-        for path in shard_folders(folders)
-    ]
-    if not wanted:
-        text = f"there are no shards in {', '.join(map(str, folders))}; {HOW_TO_MAKE_SHARDS}."
-        raise ShardError(text)
+    shards = shards_in([source.resolve() for source in sources])
+    wanted = [(f"{path.parent.name}-{path.name}-{copy}", path) for copy in range(copies) for path in shards]
     names = Counter(name for name, _ in wanted)
     if doubled := [path for name, path in wanted if names[name] > 1]:
         text = f"{doubled[0]} and {doubled[1]} would have one name; rename the folder above one of them."
