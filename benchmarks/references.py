@@ -14,7 +14,7 @@ import torch
 
 from relpose_ros.geometry import so3, so3_grid
 from relpose_ros.inference.global_rotations import joint_scores, spanning_order
-from relpose_ros.inference.pair_energies import ROWS, GridEmbeddings
+from relpose_ros.inference.pair_energies import ROWS
 
 if TYPE_CHECKING:
     from relpose_ros.inference.pair_energies import PairEnergies
@@ -27,7 +27,7 @@ ASCENT_ROUNDS = 50
 def local_lattice(radius: float, steps: int) -> torch.Tensor:
     """Rotations on a cubic lattice of tangent offsets, (2 steps + 1)^3 of them, centre included."""
     axis = torch.linspace(-radius, radius, 2 * steps + 1, dtype=torch.float64)
-    return so3.exp_tensor(torch.cartesian_prod(axis, axis, axis))
+    return torch.from_numpy(so3.exp(torch.cartesian_prod(axis, axis, axis).numpy()))
 
 
 def best_of_pair(energies: PairEnergies, pair: int, level: int) -> tuple[torch.Tensor, float]:
@@ -48,11 +48,10 @@ def exhaustive(energies: PairEnergies, level: int = 3) -> tuple[torch.Tensor, fl
         (N, 3, 3) camera_from_object and the joint score.
     """
     found = [best_of_pair(energies, pair, level) for pair in range(energies.count)]
-    grid = GridEmbeddings(energies.model)(level)
-    heights = energies.on_grid(grid).double()
+    everywhere = torch.from_numpy(np.array(so3_grid.grid(level)))
+    heights = energies.on_grid(energies.head.embed(everywhere)).double()
     strengths = torch.tensor([value for _, value in found], dtype=torch.float64) - heights.logsumexp(1)
     rotations = _along_tree(energies, [rotation for rotation, _ in found], strengths)
-    everywhere = torch.from_numpy(np.array(so3_grid.grid(level)))
     spacing = so3_grid.cell_spacing(level)
     score = float(joint_scores(energies, rotations[None])[0])
     for radius in (None, spacing, spacing / 4, spacing / 16):

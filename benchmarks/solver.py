@@ -188,7 +188,7 @@ def search_table(pairs: int) -> None:
     tokens = torch.randn(2 * pairs, network.preset.token_width, generator=torch.Generator().manual_seed(2))
     i, j = torch.arange(pairs), torch.arange(pairs) + pairs
     features = SceneFeatures(tokens, None)
-    energies = PairEnergies(network, network.pair_contexts(features, i, j), i, j, 2 * pairs)
+    energies = PairEnergies(network.energy_head(), network.pair_contexts(features, i, j), i, j, 2 * pairs)
     dense = [
         best_of_pair(energies, pair, level=3)[1] for pair in tqdm(range(pairs), desc="dense", leave=False)
     ]

@@ -1,7 +1,6 @@
 """Rotations in three dimensions: exponential and logarithm, quaternions, means.
 
 numpy float64 throughout, on any leading dimensions. Rotation vectors are axis times angle in rad.
-`exp_tensor` is the one torch twin: the solver moves rotations along tangents under autograd.
 """
 
 from __future__ import annotations
@@ -9,7 +8,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -53,20 +51,6 @@ def log(rotation: npt.ArrayLike) -> FloatArray:
     safe = np.where(small, 1.0, sine)
     scale = np.where(small, 2 + sine * sine / 3, 2 * np.arctan2(sine, q[..., 3:]) / safe)
     return np.asarray(q[..., :3] * scale)
-
-
-def exp_tensor(rotation_vector: torch.Tensor) -> torch.Tensor:
-    """Torch twin of `exp`, differentiable at zero too. (..., 3) -> (..., 3, 3)."""
-    square = (rotation_vector * rotation_vector).sum(-1)[..., None, None]
-    small = square < 1e-6
-    angle = torch.where(small, torch.ones_like(square), square).sqrt()  # never of zero: infinite slope
-    first = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
-    second = torch.where(small, 0.5 - square / 24, 2 * (torch.sin(angle / 2) / angle) ** 2)
-    x, y, z = rotation_vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*x.shape, 3, 3)
-    identity = torch.eye(3, dtype=skew.dtype, device=skew.device)
-    return identity + first * skew + second * (skew @ skew)
 
 
 def angle_between(a: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:

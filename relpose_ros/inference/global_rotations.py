@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from relpose_ros.geometry import so3, so3_grid
-from relpose_ros.inference.pair_distribution import ascend, peaks, pick, uphill
+from relpose_ros.inference.pair_distribution import ascend, peaks, pick, turned
 
 if TYPE_CHECKING:
     from relpose_ros.inference.pair_distribution import PairDistributions
@@ -99,10 +99,31 @@ class JointSolutions:
 
 
 def joint_scores(energies: PairEnergies, rotations: torch.Tensor) -> torch.Tensor:
-    """Sum over pairs of the energy of ``R_j R_i^T``. (S, N, 3, 3) -> (S,) float64; differentiable."""
-    relative = rotations[:, energies.j] @ rotations[:, energies.i].mT  # (S, P, 3, 3)
-    values = energies.at(torch.arange(energies.count), relative.transpose(0, 1))
+    """Sum over pairs of the energy of ``R_j R_i^T``. (S, N, 3, 3) -> (S,) float64."""
+    values = energies.at(torch.arange(energies.count), _all_relative(energies, rotations))
     return values.double().sum(0)
+
+
+def joint_uphill(energies: PairEnergies, rotations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """`joint_scores` and their gradients for left perturbations of each camera. -> (S,), (S, N, 3)."""
+    relative = _all_relative(energies, rotations)
+    values, slopes = energies.uphill(torch.arange(energies.count), relative)
+    # A turn w of camera i turns the pair by -R_ji w.
+    by_camera = torch.zeros(energies.views, len(rotations), 3, dtype=torch.float64)
+    by_camera.index_add_(0, energies.j, slopes)
+    by_camera.index_add_(0, energies.i, _turned_back(relative, slopes))
+    return values.sum(0), by_camera.transpose(0, 1)
+
+
+def _all_relative(energies: PairEnergies, rotations: torch.Tensor) -> torch.Tensor:
+    """Each pair's relative rotation. (S, N, 3, 3) -> (P, S, 3, 3)."""
+    cameras = rotations.transpose(0, 1)
+    return cameras[energies.j] @ cameras[energies.i].mT
+
+
+def _turned_back(relative: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:
+    """From slopes for ``exp(w) R`` to those for ``R exp(-w)``. (..., 3, 3), (..., 3) -> (..., 3)."""
+    return -(slopes[..., None, :] @ relative)[..., 0, :]
 
 
 def solve(
@@ -185,14 +206,14 @@ def _climb(energies: PairEnergies, rotations: torch.Tensor, stride: float, steps
     first = torch.zeros(*rotations.shape[:2], 3, dtype=torch.float64)
     second = torch.zeros_like(first)
     for step in range(steps + 1):
-        scores, slope = uphill(lambda each: joint_scores(energies, each), here)
+        scores, slope = joint_uphill(energies, here)
         better = scores > best_score
         best = torch.where(better[:, None, None, None], here, best)
         best_score = torch.where(better, scores, best_score)
         first = 0.8 * first + 0.2 * slope
         second = 0.95 * second + 0.05 * slope**2
         scale = (first / (1 - 0.8 ** (step + 1))) / ((second / (1 - 0.95 ** (step + 1))).sqrt() + 1e-9)
-        here = so3.exp_tensor(stride * (1 - step / steps) * scale) @ here
+        here = turned(here, stride * (1 - step / steps) * scale)
     return best
 
 
@@ -322,10 +343,14 @@ def _relative(
 
     -> (G, O, S, C, 3, 3).
     """
-    placed = rotations[torch.arange(len(cameras))[:, None], :, others][:, :, :, None]  # (G, O, S, 1, 3, 3)
+    placed = rotations[torch.arange(len(cameras))[:, None], :, others]  # (G, O, S, 3, 3)
+    groups, solutions, count = candidates.shape[:3]
+    # One product of a tall and a wide matrix for each group and solution, of whose tiles each is a rotation.
+    wide = placed.permute(0, 2, 4, 1, 3).flatten(3)  # (G, S, 3, 3 O)
+    tiles = (candidates.flatten(2, 3) @ wide).view(groups, solutions, count, 3, -1, 3)
+    camera_from_other = tiles.permute(0, 4, 1, 2, 3, 5)
     forward = (cameras[:, None] > others)[..., None, None, None, None]
-    relative = candidates[:, None] @ placed.mT  # camera from other
-    return torch.where(forward, relative, relative.mT)
+    return torch.where(forward, camera_from_other, camera_from_other.mT)
 
 
 def _conditional(
@@ -351,6 +376,23 @@ def _conditional(
     pairs = energies.pair_of[cameras[:, None], others].flatten()
     values = energies.at(pairs, relative.flatten(2, 3).flatten(0, 1))
     return values.double().view(relative.shape[:4]).sum(1)
+
+
+def _conditional_uphill(
+    energies: PairEnergies,
+    rotations: torch.Tensor,
+    cameras: torch.Tensor,
+    others: torch.Tensor,
+    candidates: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """`_conditional`, and its gradients for left perturbations of the candidates. -> (G, S, C), (..., 3)."""
+    relative = _relative(rotations, cameras, others, candidates)
+    pairs = energies.pair_of[cameras[:, None], others].flatten()
+    values, slopes = energies.uphill(pairs, relative.flatten(2, 3).flatten(0, 1))
+    slopes = slopes.view(relative.shape[:-1])
+    forward = (cameras[:, None] > others)[..., None, None, None]
+    slopes = torch.where(forward, slopes, _turned_back(relative, slopes))
+    return values.view(relative.shape[:4]).sum(1), slopes.sum(1)
 
 
 def _remembered(
@@ -415,13 +457,15 @@ def _jumped(
     gains = _conditional(energies, every, cameras, others, places)
     starts = _highest(places, gains, settings.many(settings.hills, energies.count), settings.distinct)
 
-    def height(rotations: torch.Tensor) -> torch.Tensor:
-        return _conditional(energies, every, cameras, others, rotations.view_as(starts)).flatten()
-
-    strides = torch.full((starts[..., 0, 0].numel(),), settings.hop_stride, dtype=torch.float64)
-    hills, heights = ascend(height, starts.flatten(0, 2), strides, settings.hop_steps)
-    places = torch.cat([here, hills.view_as(starts)], 2)
-    heights = torch.cat([now, heights.view(starts.shape[:3])], 2)
+    strides = torch.full(starts.shape[:3], settings.hop_stride, dtype=torch.float64)
+    hills, heights = ascend(
+        lambda places: _conditional_uphill(energies, every, cameras, others, places),
+        starts,
+        strides,
+        settings.hop_steps,
+    )
+    places = torch.cat([here, hills], 2)
+    heights = torch.cat([now, heights], 2)
     return _moved(rotations, cameras, places, heights).flatten(0, 1)
 
 
@@ -431,9 +475,9 @@ def _swept(energies: PairEnergies, rotations: torch.Tensor, radius: float, turn:
     Places lie at other directions for another ``turn``, rad.
     """
     cameras, others = torch.arange(energies.views), _others(energies.views)
-    turned = _NEIGHBOURHOOD @ so3.exp_tensor(torch.tensor([turn, turn, 0.0], dtype=torch.float64))
+    directions = _NEIGHBOURHOOD @ torch.from_numpy(so3.exp([turn, turn, 0.0]))
     every, here = _each_camera(rotations, cameras)
-    places = so3.exp_tensor(turned * radius) @ here  # the first is where the camera is
+    places = turned(here, directions * radius)  # the first is where the camera is
     heights = _conditional(energies, every, cameras, others, places)
     moved = _moved(rotations, cameras, places, heights)
     scores = joint_scores(energies, moved.flatten(0, 1)).view(moved.shape[:2])

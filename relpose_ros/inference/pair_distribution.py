@@ -169,15 +169,11 @@ def _refine_modes(
     strides: torch.Tensor,
     settings: SearchSettings,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    count = modes.shape[1]
-    pairs = torch.arange(energies.count).repeat_interleave(count)
+    pairs = torch.arange(energies.count)
     refined, best = ascend(
-        lambda rotations: energies.at(pairs, rotations[:, None])[:, 0],
-        modes.flatten(0, 1),
-        strides.flatten(),
-        settings.refinement_steps,
+        lambda rotations: energies.uphill(pairs, rotations), modes, strides, settings.refinement_steps
     )
-    refined, best = refined.view_as(modes), best.view_as(values).masked_fill(values == -math.inf, -math.inf)
+    best = best.masked_fill(values == -math.inf, -math.inf)
     best, order = torch.sort(best, dim=1, descending=True, stable=True)
     refined = pick(refined, order)
     # Two starts may have climbed the same hill: the lower one is no mode of its own.
@@ -189,7 +185,10 @@ def _refine_modes(
 
 
 def ascend(
-    height: Callable[[torch.Tensor], torch.Tensor], rotations: torch.Tensor, strides: torch.Tensor, steps: int
+    uphill: Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]],
+    rotations: torch.Tensor,
+    strides: torch.Tensor,
+    steps: int,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Climbs many rotations at once, each along its own gradient on the tangent space.
 
@@ -197,43 +196,30 @@ def ascend(
     steepness, so that the gradient's direction is trusted and its length is not.
 
     Args:
-        height: of each rotation, (Q, 3, 3) -> (Q,), differentiable.
-        rotations: (Q, 3, 3) float64 starts.
-        strides: (Q,) first steps, rad.
+        uphill: the height of each rotation, and its gradient for left perturbations ``exp(w) R``:
+            (..., 3, 3) -> (...), (..., 3), float64.
+        rotations: (..., 3, 3) float64 starts.
+        strides: (...) first steps, rad.
         steps: how many.
 
     Returns:
-        Rotations (Q, 3, 3) and heights (Q,), none lower than at the start.
+        Rotations (..., 3, 3) and heights (...), none lower than at the start.
     """
     here = rotations
-    value, slope = uphill(height, here)
+    value, slope = uphill(here)
     length = strides
     for _ in range(steps):
-        direction = slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-12)
-        there = so3.exp_tensor(direction * length[:, None]) @ here
-        new_value, new_slope = uphill(height, there)
+        direction = slope / slope.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        there = turned(here, direction * length[..., None])
+        new_value, new_slope = uphill(there)
         better = new_value > value
-        here = torch.where(better[:, None, None], there, here)
-        slope = torch.where(better[:, None], new_slope, slope)
+        here = torch.where(better[..., None, None], there, here)
+        slope = torch.where(better[..., None], new_slope, slope)
         value = torch.where(better, new_value, value)
         length = torch.where(better, length * 1.2, length * 0.4)
     return here, value
 
 
-def uphill(
-    height: Callable[[torch.Tensor], torch.Tensor], rotations: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Heights and their gradients for left perturbations. (Q, ..., 3, 3) -> (Q,) float64, (Q, ..., 3).
-
-    Args:
-        height: of each start, (Q, ..., 3, 3) -> (Q,), differentiable.
-        rotations: (Q, ..., 3, 3) float64; several of one start have one height.
-    """
-    with torch.enable_grad():
-        entries = rotations.detach().requires_grad_()
-        value = height(entries)
-        (gradient,) = torch.autograd.grad(value.sum(), entries)
-    # d tr(G^T exp(w) R) / dw at zero is the axis of the skew part of G R^T.
-    turns = gradient @ rotations.mT
-    skew = turns - turns.mT
-    return value.detach().double(), torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
+def turned(rotations: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """``exp(w) R``. (..., 3, 3), (..., 3) -> (..., 3, 3)."""
+    return torch.from_numpy(so3.exp(vectors.numpy())) @ rotations

@@ -17,7 +17,7 @@ import torch
 from relpose_ros.geometry import so3_grid
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from relpose_ros.inference.rotation_evidence import RotationEvidence
 
@@ -28,23 +28,38 @@ LAST_KEPT_LEVEL = 2
 looks at a few per cent."""
 NORMALISED = (32, 8)
 """Cells of the coarse level, and of the one below, that are split to normalise a distribution."""
-ROWS = 1024
-"""Rotations scored in one go: 1024 rows of 256 floats are 1 MB, and stay in a core's cache between layers."""
+ROWS = 2048
+"""Rotations scored in one go: enough for two cores to share, and at 256 floats a row 2 MB, which caches hold
+between layers."""
+
+
+class EnergyHead(Protocol):
+    """The part of a network that scores relative rotations; see `relpose_ros.network.energy_head`."""
+
+    def embed(self, rotations: torch.Tensor) -> torch.Tensor:
+        """What rotations contribute before a pair is known. (..., 3, 3) -> (..., H)."""
+        ...
+
+    def energies(self, contexts: torch.Tensor, embeddings: torch.Tensor) -> torch.Tensor:
+        """Unnormalised log-likelihoods. (P, H) with (K, H) or (P, K, H) -> (P, K)."""
+        ...
+
+    def energies_and_gradients(
+        self, contexts: torch.Tensor, rotations: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The same, and derivatives by the entries. (P, H), (P, K, 3, 3) -> (P, K), (P, K, 3, 3)."""
+        ...
 
 
 class EnergyModel(Protocol):
-    """The part of a network that scores relative rotations."""
+    """All of a network that the solver knows of."""
 
     def pair_contexts(self, features: Any, i: torch.Tensor, j: torch.Tensor) -> torch.Tensor:
         """What a pair contributes before a rotation is known. (P,), (P,) view positions -> (P, H)."""
         ...
 
-    def embed_relative(self, camera_j_from_camera_i: torch.Tensor) -> torch.Tensor:
-        """What a rotation contributes before a pair is known. (..., 3, 3) -> (..., H)."""
-        ...
-
-    def pair_energies(self, contexts: torch.Tensor, embeddings: torch.Tensor) -> torch.Tensor:
-        """Unnormalised log-likelihoods. (P, H) with (K, H) or (P, K, H) -> (P, K)."""
+    def energy_head(self) -> EnergyHead:
+        """What scores rotations, given those."""
         ...
 
 
@@ -58,18 +73,23 @@ class GridEmbeddings:
         self._model = model
         self._levels: dict[int, torch.Tensor] = {}
 
+    @cached_property
+    def _head(self) -> EnergyHead:
+        """Made when it is first asked for: a network that regresses rotations has none."""
+        return self._model.energy_head()
+
     def of_cells(self, level: int, cells: torch.Tensor) -> torch.Tensor:
         """Embeddings of some cells of a level. (..., C) int64 -> (..., C, H)."""
         if level <= LAST_KEPT_LEVEL:
             return self(level)[cells]
         rotations = torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
-        return self._model.embed_relative(rotations.float())
+        return self._head.embed(rotations)
 
     def __call__(self, level: int) -> torch.Tensor:
         """(72 * 8^level, H) embeddings of a whole level."""
         if level not in self._levels:
-            rotations = torch.from_numpy(np.array(so3_grid.grid(level))).float()
-            parts = [self._model.embed_relative(part) for part in torch.split(rotations, ROWS)]
+            rotations = torch.from_numpy(np.array(so3_grid.grid(level)))
+            parts = [self._head.embed(part) for part in torch.split(rotations, ROWS)]
             self._levels[level] = torch.cat(parts)
         return self._levels[level]
 
@@ -78,7 +98,7 @@ class GridEmbeddings:
 class PairEnergies:
     """All unordered pairs of N views, each scored once with i < j."""
 
-    model: EnergyModel
+    head: EnergyHead
     contexts: torch.Tensor
     """(P, H) with P = N (N - 1) / 2, ordered by i, then j."""
     i: torch.Tensor
@@ -111,7 +131,8 @@ class PairEnergies:
     ) -> PairEnergies:
         """Computes the contexts of all pairs of a scan."""
         i, j = torch.triu_indices(views, views, 1).unbind(0)
-        return cls(model, model.pair_contexts(features, i, j), i, j, views, temperature, evidence)
+        contexts = model.pair_contexts(features, i, j)
+        return cls(model.energy_head(), contexts, i, j, views, temperature, evidence)
 
     @property
     def count(self) -> int:
@@ -131,9 +152,7 @@ class PairEnergies:
         for pair in range(self.count):
             for start in range(0, len(embeddings), ROWS):
                 part = slice(start, start + ROWS)
-                energies[pair, part] = self.model.pair_energies(
-                    self.contexts[pair : pair + 1], embeddings[part]
-                )[0]
+                energies[pair, part] = self.head.energies(self.contexts[pair : pair + 1], embeddings[part])[0]
         return energies
 
     def mixed(self, grid: GridEmbeddings, flat: float) -> PairEnergies:
@@ -192,22 +211,45 @@ class PairEnergies:
         return values + (self.evidence(pairs, rotations) - blurred).to(values.dtype)
 
     def at(self, pairs: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
-        """Energies at any rotations; differentiable. (Q,) int64 pairs, (Q, K, 3, 3) -> (Q, K)."""
+        """Energies at any rotations. (Q,) int64 pairs, (Q, K, 3, 3) -> (Q, K)."""
         parts = [
-            self.model.pair_energies(
-                self.contexts[pairs[part]], self.model.embed_relative(rotations[part].to(self.contexts.dtype))
-            )
+            self.head.energies(self.contexts[pairs[part]], self.head.embed(rotations[part]))
             for part in _blocks(*rotations.shape[:2])
         ]
-        learned = self._calibrated(parts[0] if len(parts) == 1 else torch.cat(parts), pairs)
+        learned = self._calibrated(_joined(parts), pairs)
         if self.evidence is None:
             return learned
         return learned + self.evidence(pairs, rotations)
 
+    def uphill(self, pairs: torch.Tensor, rotations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Energies, and their gradients for left perturbations ``exp(w) R``.
+
+        Args:
+            pairs: (Q,) int64.
+            rotations: (Q, K, 3, 3) float64.
+
+        Returns:
+            (Q, K) and (Q, K, 3), float64.
+        """
+        parts = [
+            self.head.energies_and_gradients(self.contexts[pairs[part]], rotations[part])
+            for part in _blocks(*rotations.shape[:2])
+        ]
+        energies, gradients = (_joined(each) for each in zip(*parts, strict=True))
+        values = self._calibrated(energies, pairs).double()
+        gradients = gradients.double() * self._calibrated_slopes(energies, pairs)[..., None, None]
+        if self.evidence is not None:
+            more, more_gradients = self.evidence.with_gradients(pairs, rotations)
+            values, gradients = values + more, gradients + more_gradients
+        # d tr(G^T exp(w) R) / dw at zero is the axis of the skew part of G R^T.
+        turns = gradients @ rotations.mT
+        skew = turns - turns.mT
+        return values, torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
+
     def _learned_on_cells(self, grid: GridEmbeddings, level: int, cells: torch.Tensor) -> torch.Tensor:
         """What the network itself gives at every pair's own cells. (P, C) int64 -> (P, C)."""
         parts = [
-            self.model.pair_energies(self.contexts[part], grid.of_cells(level, cells[part]))
+            self.head.energies(self.contexts[part], grid.of_cells(level, cells[part]))
             for part in _blocks(*cells.shape)
         ]
         return torch.cat(parts)
@@ -219,6 +261,18 @@ class PairEnergies:
             uniform = torch.tensor(math.log(self.flat), dtype=energies.dtype)
             energies = torch.logaddexp(energies + self.log_share[pairs, None], uniform)
         return energies * self.weight
+
+    def _calibrated_slopes(self, energies: torch.Tensor, pairs: torch.Tensor) -> torch.Tensor:
+        """Derivatives of `_calibrated` by the network's energies. (Q, K) -> (Q, K) float64."""
+        slopes = torch.full_like(energies, self.weight / self.temperature, dtype=torch.float64)
+        if self.log_share is None:
+            return slopes
+        log_odds = energies / self.temperature + self.log_share[pairs, None] - math.log(self.flat)
+        return slopes * torch.sigmoid(log_odds)
+
+
+def _joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
 def _blocks(rows: int, columns: int) -> Iterator[slice]:

@@ -45,6 +45,18 @@ class Peak:
     """That this is the one; those of a pair sum to less than one."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Shapes:
+    """Peaks (P, M) as functions of a rotation's nine entries."""
+
+    linear: torch.Tensor
+    """(P, M, 9) and"""
+    spread: torch.Tensor
+    """(P, M, 1): the squared distance in standard deviations is ``linear . entries + spread``."""
+    tops: torch.Tensor
+    """(P, M, 1) logs of the densities at the peaks, times their probabilities."""
+
+
 class RotationEvidence:
     """The log-densities of P pairs, relative to uniform."""
 
@@ -66,9 +78,10 @@ class RotationEvidence:
         self._covariances = torch.from_numpy(covariances)
         self._log_weights = torch.from_numpy(weights).log()
         self._log_rest = torch.from_numpy(1 - weights.sum(1)).log()
+        self._known_shapes: dict[float, _Shapes] = {}
 
     def __call__(self, pairs: torch.Tensor, rotations: torch.Tensor, blur: float = 0.0) -> torch.Tensor:
-        """Log-density relative to uniform, differentiable by the rotations.
+        """Log-density relative to uniform.
 
         Args:
             pairs: (Q,) int64.
@@ -79,17 +92,44 @@ class RotationEvidence:
         Returns:
             (Q, K) float64.
         """
-        covariances = self._covariances[pairs] + blur**2 * torch.eye(3, dtype=torch.float64)  # (Q, M, 3, 3)
-        information = torch.linalg.inv(covariances)
-        log_scales = torch.linalg.slogdet(information).logabsdet / 2
-        # With v the axis of a turn D times 2 sin(angle / 2), v v^T = D + D^T - (tr D - 1) I. So the distance
-        # v^T L v is linear in D: as the rotation vector's where it is small, and smooth all around SO(3).
-        spread = information.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-        linear = (2 * information - spread * torch.eye(3, dtype=torch.float64)) @ self._peaks[pairs]
+        return torch.logsumexp(self._heights(pairs, rotations, self._shapes(blur))[0], 1)
+
+    def with_gradients(
+        self, pairs: torch.Tensor, rotations: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The same without blur, and its derivatives by the nine entries.
+
+        (Q,), (Q, K, 3, 3) -> (Q, K), (Q, K, 3, 3).
+        """
+        shapes = self._shapes(0.0)
+        heights, distances = self._heights(pairs, rotations, shapes)
+        values = torch.logsumexp(heights, 1)
+        shares = (heights[:, :-1] - values[:, None]).exp()
+        slopes = shares * (-(FREEDOM + 3) / 2) / (FREEDOM + distances)
+        return values, torch.einsum("qmk,qmx->qkx", slopes, shapes.linear[pairs]).view(rotations.shape)
+
+    def _shapes(self, blur: float) -> _Shapes:
+        """All peaks, widened; the same few widths are asked for again and again."""
+        if blur not in self._known_shapes:
+            eye = torch.eye(3, dtype=torch.float64)
+            information = torch.linalg.inv(self._covariances + blur**2 * eye)  # (P, M, 3, 3)
+            log_scales = torch.linalg.slogdet(information).logabsdet / 2
+            # With v the axis of a turn D times 2 sin(angle / 2), v v^T = D + D^T - (tr D - 1) I. So the
+            # distance v^T L v is linear in D: as the rotation vector's where it is small, and smooth all
+            # around SO(3).
+            spread = information.diagonal(dim1=-2, dim2=-1).sum(-1)
+            linear = (2 * information - spread[..., None, None] * eye) @ self._peaks
+            tops = self._log_weights + log_scales + _LOG_CONSTANT
+            self._known_shapes[blur] = _Shapes(linear.flatten(-2), spread[..., None], tops[..., None])
+        return self._known_shapes[blur]
+
+    def _heights(
+        self, pairs: torch.Tensor, rotations: torch.Tensor, shapes: _Shapes
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Logs of the mixture's parts (Q, M + 1, K), the flat rest last; distances from peaks (Q, M, K)."""
         equation = "kx,qmx->qmk" if rotations.ndim == 3 else "qkx,qmx->qmk"
-        distances = torch.einsum(equation, rotations.flatten(-2), linear.flatten(-2)) + spread[..., 0]
-        distances = distances.clamp_min(0)
-        tails = -(FREEDOM + 3) / 2 * torch.log1p(distances / FREEDOM)
-        heights = (self._log_weights[pairs] + log_scales)[..., None] + tails + _LOG_CONSTANT
+        distances = torch.einsum(equation, rotations.flatten(-2), shapes.linear[pairs])
+        distances = (distances + shapes.spread[pairs]).clamp_min(0)
+        heights = shapes.tops[pairs] - (FREEDOM + 3) / 2 * torch.log1p(distances / FREEDOM)
         rest = self._log_rest[pairs][:, None, None].expand(-1, -1, heights.shape[-1])
-        return torch.logsumexp(torch.cat([heights, rest], 1), 1)
+        return torch.cat([heights, rest], 1), distances

@@ -2,9 +2,9 @@
 
 The order of use: `RelPose.look` once per view, `RelPose.relate` once per scan, `RelPose.pair_contexts` once
 per pair, then `RelPose.pair_energies` for as many rotations as one likes. All of them take leading batch
-dimensions and gradients. `backbone_features`, `encode`, `energies` and `translations` speak the
-released network's convention (see `relpose_ros.network.conventions`); `embed_relative`,
-`optical_translations` and `optical_rotations` speak ours.
+dimensions and gradients; a solver takes `RelPose.energy_head` for the last. `backbone_features`, `encode`,
+`energies` and `translations` speak the released network's convention (see `relpose_ros.network.conventions`);
+`embed_relative`, `energy_head`, `optical_translations` and `optical_rotations` speak ours.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from torch.nn import functional
 from relpose_ros.errors import RelPoseError
 from relpose_ros.network import conventions
 from relpose_ros.network.encoder import Encoder, fourier, octaves
+from relpose_ros.network.energy_head import EnergyHead
 from relpose_ros.network.features import SceneFeatures, ViewFeatures
 from relpose_ros.network.heads import CorrelationReader, Regressor
 
@@ -196,6 +197,11 @@ class RelPose(nn.Module):
         weight = last.weight @ before.weight  # (1, H)
         bias = functional.linear(before.bias, last.weight, last.bias)
         return functional.linear(hidden, weight, bias)[..., 0]
+
+    def energy_head(self) -> EnergyHead:
+        """`embed_relative` and `pair_energies` with the weights as they are now, for many rotations."""
+        self._require_energy()
+        return EnergyHead(self)
 
     def energies(self, view_i: SceneFeatures, view_j: SceneFeatures, rotations: torch.Tensor) -> torch.Tensor:
         """Energies of relative rotations ``R_i^T R_j`` for two views of one scan. (K, 3, 3) -> (K,)."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -129,22 +128,6 @@ def test_mean_of_two_lies_between_them_by_weight(seed: int, weight: float) -> No
     whole = so3.angle_between(a, b)
     assert so3.angle_between(a, mean) + so3.angle_between(mean, b) == pytest.approx(whole, abs=1e-6)
     assert so3.mean([a, b]) == pytest.approx(so3.exp(0.5 * so3.log(b @ a.T)) @ a, abs=1e-9)
-
-
-@given(vectors, angles)
-def test_the_torch_twin_agrees_and_has_the_right_slope(vector: np.ndarray, angle: float) -> None:
-    rotation_vector = torch.tensor(angle * unit(vector), requires_grad=True)
-    rotation = so3.exp_tensor(rotation_vector)
-    assert rotation.detach().numpy() == pytest.approx(so3.exp(angle * unit(vector)), abs=1e-9)
-    weights = np.arange(9.0).reshape(3, 3)
-    (rotation * torch.tensor(weights)).sum().backward()
-    step = 1e-6
-    numeric = [
-        ((so3.exp(angle * unit(vector) + s) - so3.exp(angle * unit(vector) - s)) * weights).sum() / (2 * step)
-        for s in step * np.eye(3)
-    ]
-    assert rotation_vector.grad is not None
-    assert rotation_vector.grad.numpy() == pytest.approx(numeric, abs=1e-6)
 
 
 def test_the_ball_s_fraction_is_that_of_random_rotations() -> None:

@@ -45,14 +45,26 @@ class FisherScene:
             rows.append(np.stack([np.r_[r.ravel(), w, k] for r, w, k in padded]).ravel())
         return torch.tensor(np.array(rows), dtype=torch.float32)
 
-    def embed_relative(self, camera_j_from_camera_i: torch.Tensor) -> torch.Tensor:
-        return camera_j_from_camera_i.flatten(-2)
+    def energy_head(self) -> FisherScene:
+        return self
 
-    def pair_energies(self, contexts: torch.Tensor, embeddings: torch.Tensor) -> torch.Tensor:
+    def embed(self, rotations: torch.Tensor) -> torch.Tensor:
+        return rotations.flatten(-2).float()
+
+    def energies(self, contexts: torch.Tensor, embeddings: torch.Tensor) -> torch.Tensor:
         mixture = contexts.unflatten(-1, (self.components, 11))
         equation = "pmx,kx->pkm" if embeddings.ndim == 2 else "pmx,pkx->pkm"
         traces = torch.einsum(equation, mixture[..., :9], embeddings)
         return torch.logsumexp(mixture[:, None, :, 9] + mixture[:, None, :, 10] * (traces - 3), -1)
+
+    def energies_and_gradients(
+        self, contexts: torch.Tensor, rotations: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        with torch.enable_grad():
+            entries = rotations.detach().requires_grad_()
+            energies = self.energies(contexts, self.embed(entries))
+            (gradients,) = torch.autograd.grad(energies.sum(), entries)
+        return energies.detach(), gradients
 
     def relabelled(self, order: list[int]) -> FisherScene:
         """The same scene with its views in another order."""
