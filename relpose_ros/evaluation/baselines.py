@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from relpose_ros.geometry.cameras import translation_of
-from relpose_ros.inference.verdict import LARGEST_DEVIATION, rotation_deviations
+from relpose_ros.inference.verdict import LARGEST_ROTATION_DEVIATION, rotation_deviations
 from relpose_ros.views import Scan
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class Known:
         """See `Method`."""
         poses = self._method.poses(views)
         assert poses.deviations is not None
-        unknown = poses.deviations > LARGEST_DEVIATION
+        unknown = poses.deviations > LARGEST_ROTATION_DEVIATION
         rotations, translations = poses.rotations.copy(), poses.translations.copy()
         rotations[unknown], translations[unknown] = np.nan, np.nan
         return Poses(rotations, translations, poses.deviations)

@@ -101,7 +101,7 @@ class _Told:
     verdict: tuple[Verdict, int, str]
 
 
-CONTRADICTION = 0.5
+LARGEST_LOSS = 0.5
 """Nats a pair: refined poses that lose more of the joint energy contradict the pairs, and are not taken."""
 
 
@@ -362,7 +362,7 @@ class Estimator:
             return None
         both = torch.from_numpy(np.stack([rotations, refined.rotations]))
         before, after = joint_scores(found.energies, both).tolist()
-        return None if after < before - CONTRADICTION * found.energies.count else refined
+        return None if after < before - LARGEST_LOSS * found.energies.count else refined
 
     def _features(self, scan: Scan) -> SceneFeatures:
         looks = []

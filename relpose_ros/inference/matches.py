@@ -60,7 +60,7 @@ LARGEST_TRUST = 0.995
 """No captures are enough to learn how rare the rarest mistakes are."""
 WIDENING = 8.0
 """Factor on a matched rotation's covariance: errors of features near each other go together."""
-FLOOR = math.radians(0.3)
+MATCHING_FLOOR = math.radians(0.3)
 """Standard deviation, rad, of what no number of matches averages away: the intrinsics, above all."""
 NEAR_MISSES = 0.15
 """Share of the poses, otherwise right, that shallow relief or few well-spread points leave further off."""
@@ -68,7 +68,7 @@ NEAR_MISS = math.radians(8)
 """How far, standard deviation in rad."""
 AGREEMENT = math.radians(10)
 """Matches hold positions and points where their rotation and the cameras' agree to this, rad."""
-TRUSTED = 0.5
+LEAST_PROBABILITY = 0.5
 """Probability of a pair's poses from which on its matches count."""
 SEPARATION = math.radians(5)
 """Hypotheses nearer than this are one, rad."""
@@ -110,7 +110,7 @@ class TwoViewGeometry:
 
     def agrees(self, rotation: FloatArray) -> bool:
         """Whether the best pose is trusted and has this rotation: then its points and direction count."""
-        if not self.poses or self.probability * self.poses[0].weight < TRUSTED:
+        if not self.poses or self.probability * self.poses[0].weight < LEAST_PROBABILITY:
             return False
         return bool(so3.angle_between(rotation, self.poses[0].rotation) < AGREEMENT)
 
@@ -332,12 +332,12 @@ def peaks(geometry: TwoViewGeometry) -> list[Peak]:
     The solver looks for the highest density, and a sharp peak is high however improbable it is: two that are
     wrong, where cameras are free to suit both, would win over one that is right.
     """
-    if geometry.probability < TRUSTED:
+    if geometry.probability < LEAST_PROBABILITY:
         return []
     found = []
     for pose in geometry.poses:
         chance = geometry.probability * pose.weight
-        exact = WIDENING * pose.covariance + FLOOR**2 * np.eye(3)
+        exact = WIDENING * pose.covariance + MATCHING_FLOOR**2 * np.eye(3)
         near = exact + NEAR_MISS**2 * np.eye(3)
         found.append(Peak(pose.rotation, exact, (1 - NEAR_MISSES) * chance))
         found.append(Peak(pose.rotation, near, NEAR_MISSES * chance))

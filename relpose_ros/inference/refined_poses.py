@@ -12,7 +12,7 @@ import numpy as np
 
 from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.camera_positions import rows_of
-from relpose_ros.inference.matches import FLOOR, WIDENING, guessed_focal_covariance
+from relpose_ros.inference.matches import MATCHING_FLOOR, WIDENING, guessed_focal_covariance
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -71,9 +71,9 @@ def settle(refined: Refined, joint: FloatArray, *, guessed: bool = False) -> tup
         centres[moved], spread = _about_the_axes(rotations[moved], centres[moved], spread, silent)
     for slot, camera in enumerate(moved):
         own = np.arange(6 * slot, 6 * slot + 6)
-        spread[own[:3], own[:3]] += FLOOR**2 * float(centres[camera] @ centres[camera])
+        spread[own[:3], own[:3]] += MATCHING_FLOOR**2 * float(centres[camera] @ centres[camera])
         if camera != 0:  # whose axes are the frame's
-            spread[own[3:], own[3:]] += FLOOR**2
+            spread[own[3:], own[3:]] += MATCHING_FLOOR**2
         if guessed:
             around = np.concatenate([-so3.hat(centres[camera]), np.eye(3)])  # a turn about the object
             turned = guessed_focal_covariance(so3.log(rotations[camera]))

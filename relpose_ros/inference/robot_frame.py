@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
     FloatArray = npt.NDArray[np.float64]
 
-LARGEST_DEVIATION = 0.15
+LARGEST_SCALE_DEVIATION = 0.15
 """Of the scale, relative: above it the baselines are too short against their uncertainty to mean much."""
-CONTRADICTION = 4.0
+LARGEST_MISFIT = 4.0
 """Squared deviations relative to what the covariances say, a degree of freedom: from here on poses contradict
 each other, since twice the stated deviation on average is no chance."""
 UNKNOWN = math.radians(20)
@@ -97,7 +97,7 @@ def find_robot_frame(
     problem = _Problem(rotations, centres, covariance, poses)
     for chosen in _majorities(cameras):
         fits = [fit for subset in chosen if (fit := problem.fit(subset)) is not None]
-        agreeing = [fit for fit in fits if fit.misfit < CONTRADICTION]
+        agreeing = [fit for fit in fits if fit.misfit < LARGEST_MISFIT]
         if agreeing:
             return _told(min(agreeing, key=lambda fit: fit.misfit), frame)
     if _in_one_place([pose for k in cameras if (pose := poses[k]) is not None]):
@@ -120,7 +120,7 @@ def _majorities(cameras: Sequence[int]) -> Iterator[list[tuple[int, ...]]]:
 
 def _told(fit: _Fit, frame: str) -> RobotFrame | str:
     deviation = math.sqrt(fit.covariance[0, 0])
-    if deviation > LARGEST_DEVIATION:
+    if deviation > LARGEST_SCALE_DEVIATION:
         return f"the baselines tell it to {100 * min(deviation, 1):.0f}% only"
     order = [4, 5, 6, 1, 2, 3]  # position first, as geometry_msgs/PoseWithCovariance has it
     pose = ObjectPose(frame, fit.rotation, fit.shift, fit.covariance[np.ix_(order, order)])

@@ -40,7 +40,7 @@ CORE_ROUNDS = 6
 """Of reweighting; the scatter then changes by less than a thousandth."""
 OF_GAUSSIAN = 0.756
 """Variance that a Student's t of `FREEDOM` finds in a Gaussian of variance one, in three dimensions."""
-FLOOR = math.radians(0.1)
+SOLVER_FLOOR = math.radians(0.1)
 """The solver's own accuracy, rad: the standard deviation stated for what the gauge fixes by definition."""
 UNIFORM_VARIANCE = (math.pi**2 / 3 + 2) / 3
 """Of each component of a rotation vector whose rotation may be any, rad^2: angles a have density
@@ -321,13 +321,13 @@ def _in_object_frame(
     turns: FloatArray, rotations: FloatArray, translations: FloatArray, calibration: Calibration
 ) -> FloatArray:
     """Covariances (N, 6, 6) of poses from those of the cameras' turns, (N, 3, 3) in the cameras' own axes."""
-    spread = turns + FLOOR**2 * np.eye(3)
+    spread = turns + SOLVER_FLOOR**2 * np.eye(3)
     sigma = np.diag(np.square(calibration.translation_sigma))
     shifts = np.repeat(sigma[None], len(rotations), 0)
     # By definition of the unit of length the first camera's distance is one.
     direction = translations[0] / np.linalg.norm(translations[0])
     across = np.eye(3) - np.outer(direction, direction)
-    shifts[0] = across @ sigma @ across + FLOOR**2 * np.eye(3)
+    shifts[0] = across @ sigma @ across + SOLVER_FLOOR**2 * np.eye(3)
     covariances = np.zeros((len(rotations), 6, 6))
     for camera, object_from_camera in enumerate(rotations.transpose(0, 2, 1)):
         # A turn e of the camera (axes of the camera, left perturbation of camera_from_object) is the turn

@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 
     from relpose_ros.estimates import PairRotation
 
-TRUSTED = 0.6
+TRUSTED_PROBABILITY = 0.6
 """A pair is trusted when this much of its probability lies within 15 degrees of the final poses: more likely
 right than wrong with a margin, and impossible for a pair with two equal modes. A chain of pairs is trusted
 when the product of theirs is as much."""
 HARDLY_ANYTHING = 2
 """Percent within 15 degrees below which a number would claim more than is known; uniform has 0.1."""
-CONTRADICTION = math.radians(10)
+CONTRADICTION_ANGLE = math.radians(10)
 """From this angle on between a pair's own rotation and the final poses' the two disagree."""
-LARGEST_DEVIATION = math.radians(12)
+LARGEST_ROTATION_DEVIATION = math.radians(12)
 """Largest standard deviation (worst axis) of a camera's rotation: within 15 degrees more often than not."""
 ONE_MORE = "one more view: "
 NOT_ENOUGH = "not enough: "
@@ -61,14 +61,14 @@ def judge(
     """
     deviations = rotation_deviations(covariances)
     tied = _tied(pairs, len(covariances))
-    trusted = [p for p, pair in enumerate(pairs) if pair.solution_probability >= TRUSTED]
+    trusted = [p for p, pair in enumerate(pairs) if pair.solution_probability >= TRUSTED_PROBABILITY]
     if all(tied) and (unchecked := _unchecked(pairs, trusted)) is not None:
         bridge, views = unchecked
         hangs = f"view {views[0]} hangs" if len(views) == 1 else f"views {_listed(views)} hang"
         pair = pairs[bridge]
         reason = f"{hangs} on pair {pair.i}-{pair.j} alone, which no other pair checks"
         return Verdict.ONE_MORE_VIEW, bridge, f"{ONE_MORE}{reason}"
-    if all(tied) and deviations.max() <= LARGEST_DEVIATION:
+    if all(tied) and deviations.max() <= LARGEST_ROTATION_DEVIATION:
         weakest = min(range(len(pairs)), key=lambda p: _certainty(pairs[p]))
         if calibrated:
             worst = math.degrees(deviations.max())
@@ -119,9 +119,9 @@ def _weakness(pair: PairRotation) -> str:
     name = f"pair {pair.i}-{pair.j}"
     if pair.ambiguous:
         return f"{name} is ambiguous by about {10 * round(math.degrees(pair.ambiguity_angle) / 10)} degrees"
-    if pair.probability_within_15_deg >= TRUSTED and pair.solution_angle < CONTRADICTION:
+    if pair.probability_within_15_deg >= TRUSTED_PROBABILITY and pair.solution_angle < CONTRADICTION_ANGLE:
         return f"the chain of pairs is long, and {name} is its weak link"
-    if pair.probability_within_15_deg >= TRUSTED:
+    if pair.probability_within_15_deg >= TRUSTED_PROBABILITY:
         return f"{name} contradicts the others by about {math.degrees(pair.solution_angle):.0f} degrees"
     chance = 100 * pair.probability_within_15_deg
     if chance < HARDLY_ANYTHING:
@@ -179,4 +179,4 @@ def _tied(pairs: Sequence[PairRotation], views: int) -> list[bool]:
         for pair in pairs:
             reached[pair.i] = max(reached[pair.i], reached[pair.j] * pair.solution_probability)
             reached[pair.j] = max(reached[pair.j], reached[pair.i] * pair.solution_probability)
-    return [chance >= TRUSTED for chance in reached]
+    return [chance >= TRUSTED_PROBABILITY for chance in reached]

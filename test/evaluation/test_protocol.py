@@ -14,7 +14,7 @@ from relpose_ros.evaluation.protocol import EvaluationError, PosedViews
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import look_at, translation_of
 from relpose_ros.inference.estimator import Estimator
-from relpose_ros.inference.verdict import LARGEST_DEVIATION
+from relpose_ros.inference.verdict import LARGEST_ROTATION_DEVIATION
 from relpose_ros.network.checkpoint import random_network, write_network
 from relpose_ros.network.presets import named_preset
 from relpose_ros.views import BoundingBox, View
@@ -99,7 +99,7 @@ def test_cameras_that_are_called_unknown_are_left_out_as_colmap_leaves_out_its_o
             poses = Oracle(sequence).poses(views)
             translations = poses.translations.copy()
             translations[2] *= -3
-            deviations = np.where(np.arange(len(views)) == 2, 2 * LARGEST_DEVIATION, 0.01)
+            deviations = np.where(np.arange(len(views)) == 2, 2 * LARGEST_ROTATION_DEVIATION, 0.01)
             return Poses(poses.rotations, translations, deviations)
 
     whole, known = protocol.measure(sequence, [OneWrong(), Known("known", OneWrong())], [5], orders=2)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.camera_positions import joined
-from relpose_ros.inference.robot_frame import LARGEST_DEVIATION, RobotFrame, find_robot_frame
+from relpose_ros.inference.robot_frame import LARGEST_SCALE_DEVIATION, RobotFrame, find_robot_frame
 from relpose_ros.views import RobotPose
 
 METRES = 0.4
@@ -175,7 +175,7 @@ def test_baselines_too_short_against_their_uncertainty():
     assert found.startswith("the baselines tell it to ")
     long = find_robot_frame(rotations, centres, spread(3, 0.05), told(rotations, centres))
     assert isinstance(long, RobotFrame)
-    assert long.deviation < LARGEST_DEVIATION
+    assert long.deviation < LARGEST_SCALE_DEVIATION
 
 
 def test_the_deviation_falls_with_longer_baselines():

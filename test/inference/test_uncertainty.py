@@ -16,7 +16,7 @@ from relpose_ros.inference.global_rotations import solve
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 from relpose_ros.inference.uncertainty import (
-    FLOOR,
+    SOLVER_FLOOR,
     _turns,
     camera_covariances,
     describe_pairs,
@@ -166,9 +166,9 @@ def test_covariances_are_never_placeholders(fisher_scene_type, seed, views, conc
     for covariance in covariances:
         np.testing.assert_array_equal(covariance, covariance.T)
         assert np.linalg.eigvalsh(covariance)[0] > 1e-8
-        assert np.linalg.eigvalsh(covariance[3:, 3:])[0] >= FLOOR**2 * 0.999
+        assert np.linalg.eigvalsh(covariance[3:, 3:])[0] >= SOLVER_FLOOR**2 * 0.999
         assert not np.allclose(covariance, np.eye(6))
-    np.testing.assert_allclose(covariances[0, 3:, 3:], FLOOR**2 * np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(covariances[0, 3:, 3:], SOLVER_FLOOR**2 * np.eye(3), atol=1e-12)
 
 
 def test_position_and_rotation_covary_as_a_camera_on_a_lever(fisher_scene, cameras_around):
