@@ -135,7 +135,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME",
         help="relpose (as it ships), relpose-known (its known cameras alone), both (network and matches, not "
         "refined), learned (the network alone), geometry (the matches alone), constant-translation, identity "
-        "or colmap; again for more (default: all)",
+        "or pycolmap; again for more (default: all)",
     )
     evaluate.add_argument(
         "--variant",

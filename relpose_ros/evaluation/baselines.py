@@ -54,13 +54,13 @@ class Estimated:
     """The estimator of this package."""
 
     def __init__(self, name: str, estimator: Estimator) -> None:
-        """Wrap an estimator, whose feature cache makes prefixes of a scan cheap."""
+        """Wrap an estimator."""
         self.name = name
         self._estimator = estimator
         self._last: tuple[tuple[View, ...], Poses] | None = None
 
     def poses(self, views: Sequence[View]) -> Poses:
-        """See `Method`. The latest answer is kept: `ConstantTranslation` asks for the same one."""
+        """See `Method`. The latest answer is kept: a method that changes it asks for the same one."""
         key = tuple(views)
         if self._last is None or self._last[0] != key:
             estimate = self._estimator.estimate(Scan(object_id="evaluation", views=key))
@@ -127,7 +127,7 @@ class Colmap:
     Views missing from the largest reconstruction have no answer.
     """
 
-    name = "colmap"
+    name = "pycolmap"
 
     def __init__(self, seed: int = 0) -> None:
         """Import pycolmap, which only this baseline needs."""

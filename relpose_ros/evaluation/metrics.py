@@ -69,7 +69,7 @@ def center_errors(
     """Distance of the camera centres to the true ones after the best similarity, by scene scale.
 
     Two cameras can always be aligned: at N = 2 every error is 0. Cameras without an estimate take no
-    part in the alignment.
+    part in the alignment, and one alone has no place beside others: its error is infinite too.
 
     Args:
         rotations: (N, 3, 3), nan where a camera has no estimate.
@@ -84,7 +84,7 @@ def center_errors(
     r = np.asarray(rotations, np.float64)
     known = _known(r) & _known(translations)
     errors = np.full(len(r), np.inf)
-    if known.any():
+    if known.sum() > 1:
         centres = camera_centre(r[known], np.asarray(translations, np.float64)[known])
         truth = camera_centre(np.asarray(true_rotations)[known], np.asarray(true_translations)[known])
         errors[known] = np.linalg.norm(align_points(centres, truth).apply(centres) - truth, axis=1) / scale
@@ -102,7 +102,7 @@ def translation_errors(
     r = np.asarray(rotations, np.float64)
     known = _known(r) & _known(translations)
     errors = np.full(len(r), np.inf)
-    if known.any():
+    if known.sum() > 1:
         r, t = r[known], np.asarray(translations, np.float64)[known]
         truth = np.asarray(true_translations, np.float64)[known]
         s, c = align_translations(truth, r, t)

@@ -19,7 +19,7 @@ from relpose_ros.network.presets import variants_of
 from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     import numpy.typing as npt
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     FloatArray = npt.NDArray[np.float64]
 
 Row = dict[str, Any]
-"""One line of the result: capture, method, views, scans, the figures of `metrics.summary`, seconds; where the
-method is an estimator, those of `trust.summary` too."""
+"""One line of the result: capture, method, views, scans, the figures of `metrics.summary`, seconds that a scan
+of new views takes; where the method is an estimator, those of `trust.summary` too."""
 
 METHODS = (
     *("relpose", "relpose-known", "both", "learned", "geometry"),
-    *("constant-translation", "identity", "colmap"),
+    *("constant-translation", "identity", "pycolmap"),
 )
 """relpose is the estimator as it ships: the network, matches and refinement; relpose-known its cameras that
 it calls known itself. both leaves out the refinement, learned the matches too, geometry the network."""
@@ -56,16 +56,21 @@ ORDERS = 5
 """Random orders a capture, as in the paper."""
 MEAN = "mean"
 """The ``capture`` of the rows that average over captures."""
-SHOWN = (
-    "rotation@15",
-    "rotation@30",
-    "rotation@median",
-    "center@0.1",
-    "center@0.2",
-    "translation@0.1",
-    "seconds",
-)
-"""The columns of a table; the JSON has all figures."""
+SHOWN = {
+    "rotation@5": "R@5",
+    "rotation@10": "R@10",
+    "rotation@15": "R@15",
+    "rotation@30": "R@30",
+    "rotation@auc60": "R auc",
+    "rotation@median": "R median",
+    "center@0.1": "C@0.1",
+    "center@0.2": "C@0.2",
+    "center@0.3": "C@0.3",
+    "center@auc0.4": "C auc",
+    "translation@0.1": "T@0.1",
+    "seconds": "seconds",
+}
+"""The columns of a table, and their heads: rotation, camera centre, translation."""
 
 
 class EvaluationError(RelPoseError):
@@ -174,7 +179,8 @@ def measure(
 
     Args:
         sequence: The capture.
-        methods: What estimates. All get the same `View` objects, in the same order.
+        methods: What estimates. Each gets views that it has not seen, but for those of `DERIVED`, which share
+            their source's; the time of the source is a part of theirs.
         views: Numbers of views, 2 to 8.
         orders: Random orders.
         seed: Of the orders.
@@ -199,10 +205,15 @@ def _scans(
         held = [sequence.view(k) for k in order]
         for n in depths:
             true_r, true_t = rotations[order[:n]], translations[order[:n]]
+            # Estimators keep what they know of a view, and know nothing of another object with its picture.
+            fresh: dict[str, list[View]] = {}
+            seconds: dict[str, float] = {}
             for method in methods:
+                source = DERIVED.get(method.name, method.name)
+                given = fresh.setdefault(source, [replace(view) for view in held[:n]])
                 started = time.perf_counter()
-                poses = method.poses(held[:n])
-                seconds = time.perf_counter() - started
+                poses = method.poses(given)
+                seconds[source] = seconds.get(source, 0.0) + time.perf_counter() - started
                 estimate = poses.estimate
                 scans[method.name, n].append(
                     _Measured(
@@ -210,7 +221,7 @@ def _scans(
                         metrics.center_errors(poses.rotations, poses.translations, true_r, true_t, scale),
                         metrics.translation_errors(poses.rotations, poses.translations, true_t, scale),
                         None if estimate is None else trust.statements(estimate, true_r, true_t),
-                        seconds,
+                        seconds[source],
                     )
                 )
                 on_scan()
@@ -249,19 +260,26 @@ def mean_rows(rows: Iterable[Row]) -> list[Row]:
     means = []
     for (method, views), group in groups.items():
         row = {"capture": MEAN, "method": method, "views": views, "scans": sum(r["scans"] for r in group)}
-        figures = [key for key in group[0] if key not in row]
+        figures = [key for key in group[0] if key not in row and all(key in each for each in group)]
         means.append({**row, **{key: float(np.mean([r[key] for r in group])) for key in figures}})
     return means
 
 
-def table(rows: Sequence[Row], columns: Sequence[str] = SHOWN) -> str:
-    """Rows as text for a terminal: fractions in percent, degrees and seconds as they are."""
-    heads = ["capture", "method", "N", "scans", *columns]
+def table(rows: Sequence[Row], columns: Mapping[str, str] = SHOWN) -> str:
+    """Rows as text for a terminal: fractions in percent, degrees and seconds as they are.
+
+    Args:
+        rows: Of one or more captures.
+        columns: Figures, and the heads above them; a figure that a row has not is left blank.
+    """
+    heads = ["capture", "method", "N", "scans", *columns.values()]
     lines = [heads]
     for row in rows:
         cells = [str(row["capture"]), str(row["method"]), str(row["views"]), str(row["scans"])]
         for column in columns:
-            if column == "seconds":
+            if column not in row:
+                cells.append("")
+            elif column == "seconds":
                 cells.append(f"{row[column]:.2f}")
             elif column.endswith("median"):
                 cells.append(f"{row[column]:.1f}")
@@ -281,7 +299,7 @@ def table(rows: Sequence[Row], columns: Sequence[str] = SHOWN) -> str:
 
 def trust_table(rows: Sequence[Row]) -> str:
     """As `table`: how far what estimators say of their own errors holds; empty without estimators."""
-    estimated = [row for row in rows if row["capture"] == MEAN and trust.SHOWN[0] in row]
+    estimated = [row for row in rows if row["capture"] == MEAN and "enough" in row]
     return table(estimated, trust.SHOWN) if estimated else ""
 
 
@@ -387,7 +405,7 @@ def _methods(
             chosen.append(baselines.Known(name, estimating[of]))
         elif name == "identity":
             chosen.append(baselines.Identity())
-        elif name == "colmap":
+        elif name == "pycolmap":
             chosen.append(baselines.Colmap(seed))
     return chosen
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from relpose_ros.estimates import Verdict
+from relpose_ros.estimates import Evidence, Verdict
 from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.calibration import (
     LEVELS,
@@ -26,17 +26,21 @@ if TYPE_CHECKING:
 
     FloatArray = npt.NDArray[np.float64]
 
-SHOWN = (
-    "stated@15",
-    "strongest@15",
-    "calibration_error@15",
-    "pairs_inside@90",
-    "rotations_inside@90",
-    "positions_inside@90",
-    "enough",
-    "enough_wrong",
-)
-"""The columns of a table."""
+SHOWN = {
+    "stated@15": "stated@15",
+    "strongest@15": "right@15",
+    "calibration_error@15": "error",
+    "matched_pairs": "matched",
+    "matched_stated@15": "their stated",
+    "matched_strongest@15": "right",
+    "matched_calibration_error@15": "error",
+    "pairs_inside@90": "pairs in 90",
+    "rotations_inside@90": "rotations",
+    "positions_inside@90": "positions",
+    "enough": "enough",
+    "enough_wrong": "and wrong",
+}
+"""The columns of a table, and their heads; after the share of pairs that matches speak of, those alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +51,8 @@ class Statements:
     """(P,) probability of each pair that its strongest mode is within 15 degrees of the truth."""
     right: npt.NDArray[np.bool_]
     """(P,) whether it is."""
+    matched: npt.NDArray[np.bool_]
+    """(P,) whether matches are among what it rests on."""
     pair_squares: FloatArray
     """(P,) squared errors of the strongest modes in units of the stated covariances."""
     rotation_squares: FloatArray
@@ -89,6 +95,7 @@ def statements(
     return Statements(
         stated=np.array([pair.probability_within_15_deg for pair in estimate.pairs]),
         right=np.array(right),
+        matched=np.array([Evidence.GEOMETRIC in pair.evidence for pair in estimate.pairs]),
         pair_squares=np.array(pair_squares),
         rotation_squares=np.array(rotation_squares),
         position_squares=np.array(position_squares),
@@ -101,20 +108,25 @@ def summary(group: Sequence[Statements]) -> dict[str, float]:
     """Figures of many scans' statements, all from 0 to 1.
 
     ``stated@15`` and ``strongest@15`` are equal on average where probabilities hold, and
-    ``calibration_error@15`` is their mean distance over bins of the stated one. ``pairs_inside@90``,
+    ``calibration_error@15`` is their mean distance over bins of the stated one. Of the share
+    ``matched_pairs``, of which matches speak, the same three with ``matched_`` before them, where there are
+    any. ``pairs_inside@90``,
     ``rotations_inside@90`` and ``positions_inside@90`` are the shares of errors inside the 90 %
     ellipsoids (likewise 50 and 95). ``enough`` is the share of scans that are called enough, and
     ``enough_wrong`` of those that are called so although a pair is off by more than 15 degrees.
     """
     stated = np.concatenate([each.stated for each in group])
     right = np.concatenate([each.right for each in group])
+    matched = np.concatenate([each.matched for each in group])
     figures = {
-        "stated@15": float(stated.mean()),
-        "strongest@15": float(right.mean()),
-        "calibration_error@15": expected_calibration_error(stated, right),
+        **_calibration(stated, right),
+        "matched_pairs": float(matched.mean()),
         "enough": float(np.mean([each.enough for each in group])),
         "enough_wrong": float(np.mean([each.enough and each.wrong for each in group])),
     }
+    if matched.any():
+        of_matched = _calibration(stated[matched], right[matched])
+        figures |= {f"matched_{name}": figure for name, figure in of_matched.items()}
     for name, squares in (
         ("pairs", [each.pair_squares for each in group]),
         ("rotations", [each.rotation_squares for each in group]),
@@ -123,3 +135,11 @@ def summary(group: Sequence[Statements]) -> dict[str, float]:
         for level, share in zip(LEVELS, coverage(np.concatenate(squares)), strict=True):
             figures[f"{name}_inside@{100 * level:g}"] = share
     return figures
+
+
+def _calibration(stated: FloatArray, right: npt.NDArray[np.bool_]) -> dict[str, float]:
+    return {
+        "stated@15": float(stated.mean()),
+        "strongest@15": float(right.mean()),
+        "calibration_error@15": expected_calibration_error(stated, right),
+    }

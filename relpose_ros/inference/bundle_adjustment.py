@@ -1,6 +1,7 @@
-"""Refines poses by the points that three or more views share: bundle adjustment with fixed intrinsics.
+"""Refines poses by the points that views share, first those of three or more: bundle adjustment.
 
-It may only improve: `refine` answers with poses that reproject the same points better, or with None.
+Intrinsics are fixed. It may only improve: `refine` answers with poses that reproject the same points better,
+or with None.
 
 The least squares are our own, since no solver of SciPy's knows that a point ties no other point: on scans of
 photographs the sparse steps of `least_squares` (LSMR) took four times as long and stopped short in some of

@@ -101,6 +101,11 @@ class _Told:
     verdict: tuple[Verdict, int, str]
 
 
+def _require_scan(what: str, views: int) -> None:
+    if not MIN_VIEWS <= views <= MAX_VIEWS:
+        raise ScanError(f"{what} {views} views; an estimate takes {MIN_VIEWS} to {MAX_VIEWS}.")
+
+
 LARGEST_LOSS = 0.5
 """Nats a pair: refined poses that lose more of the joint energy contradict the pairs, and are not taken."""
 
@@ -192,11 +197,7 @@ class Estimator:
         Raises:
             ScanError: if the scan has fewer than 2 views or more than 8.
         """
-        if not MIN_VIEWS <= len(scan.views) <= MAX_VIEWS:
-            raise ScanError(
-                f"The scan of '{scan.object_id}' has {len(scan.views)} views; "
-                f"an estimate takes {MIN_VIEWS} to {MAX_VIEWS}."
-            )
+        _require_scan(f"The scan of '{scan.object_id}' has", len(scan.views))
         with self._lock:
             start = time.perf_counter()
             told = self._regressed(scan) if self._regresses else self._solved(scan)
@@ -255,11 +256,17 @@ class Estimator:
 
     @torch.no_grad()
     def rotations(self, features: SceneFeatures) -> FloatArray:
-        """The jointly best rotations, camera_from_object, the first the identity. -> (N, 3, 3)."""
-        if self._regresses:
-            return regressed_poses(self._network, features)[0]
-        energies = PairEnergies.of(self._network, features, len(features))
-        return np.asarray(solve(energies, search(energies, self._grid)).rotations[0].numpy())
+        """The jointly best rotations, camera_from_object, the first the identity. -> (N, 3, 3).
+
+        Raises:
+            ScanError: There are fewer than 2 views or more than 8.
+        """
+        _require_scan("The features are of", len(features))
+        with self._lock:
+            if self._regresses:
+                return regressed_poses(self._network, features)[0]
+            energies = PairEnergies.of(self._network, features, len(features))
+            return np.asarray(solve(energies, search(energies, self._grid)).rotations[0].numpy())
 
     def _solved(self, scan: Scan) -> _Told:
         """What the pairs' distributions say together."""

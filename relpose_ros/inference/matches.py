@@ -332,7 +332,9 @@ def peaks(geometry: TwoViewGeometry) -> list[Peak]:
     The solver looks for the highest density, and a sharp peak is high however improbable it is: two that are
     wrong, where cameras are free to suit both, would win over one that is right.
     """
-    if geometry.probability < LEAST_PROBABILITY:
+    # Points that lie too close together suit so many poses that few of them are told.
+    told = sum(pose.weight for pose in geometry.poses)
+    if min(geometry.probability, told) < LEAST_PROBABILITY:
         return []
     found = []
     for pose in geometry.poses:

@@ -129,6 +129,15 @@ def test_cameras_without_an_estimate_count_as_wrong_and_leave_the_others_alone()
     assert all(np.isfinite(list(figures.values())))
 
 
+def test_one_camera_alone_has_no_place():
+    """Anything can be moved onto it."""
+    r, t, _ = cameras(9, 3)
+    lone_r, lone_t = r.copy(), t.copy()
+    lone_r[1:], lone_t[1:] = np.nan, np.nan
+    assert np.isinf(metrics.center_errors(lone_r, lone_t, r, t, 1.0)).all()
+    assert np.isinf(metrics.translation_errors(lone_r, lone_t, t, 1.0)).all()
+
+
 def test_no_estimate_at_all_scores_nothing():
     r, t, _ = cameras(8, 4)
     nothing = np.full_like(r, np.nan), np.full_like(t, np.nan)

@@ -1,6 +1,7 @@
 """The protocol: the same orders for everybody, prefixes of each other; a perfect method scores perfectly."""
 
 import json
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -86,6 +87,28 @@ def test_constant_translation_keeps_the_rotations_and_suits_cameras_that_look_at
     partial = ConstantTranslation(Oracle(sequence, fails_from=2)).poses([sequence.view(k) for k in range(3)])
     assert np.isnan(partial.translations[2]).all()
     assert np.isfinite(partial.translations[:2]).all()
+
+
+def test_seconds_are_those_of_new_views_and_a_derived_method_pays_for_its_source():
+    sequence, seen = posed(), []
+
+    class Slow:
+        name = "relpose"
+
+        def __init__(self):
+            self.last = None
+
+        def poses(self, views):
+            if self.last != views:
+                time.sleep(0.02)
+                seen.extend(views)
+                self.last = list(views)
+            return replace(Oracle(sequence).poses(views), deviations=np.zeros(len(views)))
+
+    slow = Slow()
+    rows = protocol.measure(sequence, [slow, Known("relpose-known", slow)], [2, 3], orders=2)
+    assert len(set(map(id, seen))) == len(seen) == 2 * (2 + 3)
+    assert min(row["seconds"] for row in rows) >= 0.02
 
 
 def test_cameras_that_are_called_unknown_are_left_out_as_colmap_leaves_out_its_own():
@@ -208,7 +231,7 @@ def test_weights_that_regress_are_measured_by_the_methods_they_have(weights):
     pytest.importorskip("pycolmap")
     rows = protocol.evaluate([sequence], [2], weights("regression"), orders=1, progress=False)
     methods = [row["method"] for row in rows if row["capture"] == "thing"]
-    assert methods == ["learned", "constant-translation", "identity", "colmap"]
+    assert methods == ["learned", "constant-translation", "identity", "pycolmap"]
 
 
 def test_in_the_mean_statements_are_held_against_all_scans_together(weights):

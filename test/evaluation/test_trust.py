@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relpose_ros.estimates import CameraPose, Mode, PairRotation, ScanEstimate, Verdict
+from relpose_ros.estimates import CameraPose, Evidence, Mode, PairRotation, ScanEstimate, Verdict
 from relpose_ros.evaluation import trust
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import camera_centre, look_at, look_at_translations, translation_of
@@ -83,6 +83,19 @@ def test_probabilities_are_held_against_frequencies(group):
     assert figures["stated@15"] == pytest.approx(0.8)
     assert figures["strongest@15"] == pytest.approx((within < np.radians(15)).mean(), abs=0.03)
     assert figures["calibration_error@15"] == pytest.approx(figures["strongest@15"] - 0.8, abs=1e-9)
+
+
+def test_pairs_that_matches_speak_of_are_told_apart():
+    generator = np.random.default_rng(2)
+    rotations, translations = truth(generator, 4)
+    estimate = estimated(generator, rotations, translations)
+    assert "matched_stated@15" not in trust.summary([trust.statements(estimate, rotations, translations)])
+    matched = replace(estimate.pairs[1], evidence=Evidence.GEOMETRIC, probability_within_15_deg=0.99)
+    estimate = replace(estimate, pairs=(estimate.pairs[0], matched, *estimate.pairs[2:]))
+    figures = trust.summary([trust.statements(estimate, rotations, translations)])
+    assert figures["matched_pairs"] == pytest.approx(1 / 6)
+    assert figures["matched_stated@15"] == pytest.approx(0.99)
+    assert figures["stated@15"] == pytest.approx((5 * 0.8 + 0.99) / 6)
 
 
 def test_enough_is_wrong_where_a_pair_of_the_final_poses_is_off():

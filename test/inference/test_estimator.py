@@ -17,6 +17,7 @@ from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.estimator import Estimator, EvidenceSettings, ScanError
 from relpose_ros.inference.predictions import regressed_poses
 from relpose_ros.network.checkpoint import random_network, write_network
+from relpose_ros.network.features import SceneFeatures
 from relpose_ros.network.presets import PRESETS, named_preset
 from relpose_ros.views import BoundingBox, RobotPose, Scan, View
 
@@ -156,6 +157,9 @@ def test_two_views_are_told_as_their_most_probable_mode(network, seed):
 def test_refuses_what_no_estimate_can_be_made_of(network, count):
     with pytest.raises(ScanError, match=f"'mug' has {count} views; an estimate takes 2 to 8"):
         Estimator(network).estimate(scan(*range(count)))
+    features = SceneFeatures(torch.zeros(count, network.preset.token_width), None)
+    with pytest.raises(ScanError, match=f"The features are of {count} views"):
+        Estimator(network).rotations(features)
 
 
 def test_threads_do_not_mix_scans(network):

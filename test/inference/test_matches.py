@@ -259,6 +259,12 @@ def test_peaks_share_the_probability_of_the_poses():
     assert sorted(deviations)[-1] > 5
 
 
+@pytest.mark.parametrize(("weights", "told"), [((0.3, 0.25), True), ((0.2, 0.15, 0.1), False)])
+def test_poses_that_are_a_few_of_many_say_nothing(weights, told):
+    poses = tuple(pose(so3.exp([0, k, 0]), weight) for k, weight in enumerate(weights))
+    assert bool(peaks(TwoViewGeometry(poses, np.zeros((200, 2), np.int64), 0.98))) == told
+
+
 def test_only_trusted_matches_with_the_cameras_rotation_count():
     geometry = TwoViewGeometry((pose(np.eye(3), 1.0),), np.zeros((9, 2), np.int64), 0.9)
     assert geometry.agrees(so3.exp([0, math.radians(9), 0]))
