@@ -2,8 +2,8 @@
 
     python -m benchmarks.evidence [--threads 2] [--bag bags/textured_object] [--repeats 3]
 
-Side by side in one run: all views new, and one view more on a scan whose other views are known. Least seconds of
-the repeats; in brackets what is added to the network alone.
+Side by side in one run: all views new, and one view more on a scan whose other views are known. Least seconds
+of the repeats; in brackets what is added to the network alone.
 """
 
 from __future__ import annotations

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     FloatArray = npt.NDArray[np.float64]
 
 Row = dict[str, Any]
-"""One line of the result: capture, method, views, scans, the figures of `metrics.summary`, seconds that a scan
-of new views takes; where the method is an estimator, those of `trust.summary` too."""
+"""One line of the result: capture, method, views, scans, the figures of `metrics.summary`, seconds that a
+scan of new views takes; where the method is an estimator, those of `trust.summary` too."""
 
 METHODS = (
     *("relpose", "relpose-known", "both", "learned", "geometry"),

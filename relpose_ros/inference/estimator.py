@@ -75,7 +75,7 @@ class _Found:
     """Of the sum of energies, which are log-densities as they are."""
 
     @property
-    def joint_energies(self) -> PairEnergies:
+    def tempered_energies(self) -> PairEnergies:
         """The energies as they add up over a scan.
 
         Every view takes part in N - 1 pairs, whose errors in the network's eyes go together: beside matches,
@@ -276,7 +276,7 @@ class Estimator:
             # Two views have nothing to be joined to: where probabilities hold, the most of them counts, and
             # not the highest density, which a narrow peak has that is hardly ever right.
             known = heaviest_modes(known)
-        solution = solve(found.joint_energies, known).rotations[0]
+        solution = solve(found.tempered_energies, known).rotations[0]
         translations = predicted_translations(self._network, found.features, solution.numpy())
         covariances = camera_covariances(
             found.distributions, found.energies, solution, translations, found.calibration

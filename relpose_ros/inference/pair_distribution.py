@@ -49,7 +49,7 @@ class PairDistributions:
     rotations: torch.Tensor
     """(P, L, 3, 3) cell centres, camera_j_from_camera_i."""
     energies: torch.Tensor
-    """(P, L) as `PairEnergies` gives them, without the blur of the evidence."""
+    """(P, L) as `PairEnergies` gives them, the evidence blurred in the finest cells alone."""
     log_volumes: torch.Tensor
     """(L,) log of the share of SO(3) that a cell fills; the same for every pair."""
     spacings: torch.Tensor

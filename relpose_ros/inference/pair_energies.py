@@ -19,6 +19,8 @@ from relpose_ros.geometry import so3_grid
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    import numpy.typing as npt
+
     from relpose_ros.inference.rotation_evidence import RotationEvidence
 
 COARSE_LEVEL = 1
@@ -181,21 +183,14 @@ class PairEnergies:
     def on_level(self, grid: GridEmbeddings, level: int) -> torch.Tensor:
         """Energies of every pair on a whole level. -> (P, 72 * 8^level)."""
         known = self.coarse if level == COARSE_LEVEL else None
-        learned = self._calibrated(self.on_grid(grid(level)) if known is None else known, slice(None))
-        if self.evidence is None:
-            return learned
-        rotations = torch.from_numpy(np.array(so3_grid.grid(level)))
-        blur = so3_grid.cell_spacing(level) / 2
-        return learned + self.evidence(torch.arange(self.count), rotations, blur).to(learned.dtype)
+        return self._at_cells(
+            level, self.on_grid(grid(level)) if known is None else known, so3_grid.grid(level)
+        )
 
     def on_cells(self, grid: GridEmbeddings, level: int, cells: torch.Tensor) -> torch.Tensor:
         """Energies of every pair at its own cells of a level. (P, C) int64 -> (P, C)."""
-        learned = self._calibrated(self._learned_on_cells(grid, level, cells), slice(None))
-        if self.evidence is None:
-            return learned
-        rotations = torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
-        blur = so3_grid.cell_spacing(level) / 2
-        return learned + self.evidence(torch.arange(self.count), rotations, blur).to(learned.dtype)
+        centres = so3_grid.cell_rotations(level, cells.numpy())
+        return self._at_cells(level, self._learned_on_cells(grid, level, cells), centres)
 
     def at_centres(self, level: int, cells: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         """What `on_cells` gave, without the blur of the evidence. (P, C) twice -> (P, C).
@@ -245,6 +240,14 @@ class PairEnergies:
         turns = gradients @ rotations.mT
         skew = turns - turns.mT
         return values, torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
+
+    def _at_cells(self, level: int, learned: torch.Tensor, centres: npt.NDArray[np.float64]) -> torch.Tensor:
+        """From the network's energies of a level's cells to those of all evidence."""
+        calibrated = self._calibrated(learned, slice(None))
+        if self.evidence is None:
+            return calibrated
+        rotations, blur = torch.from_numpy(np.array(centres)), so3_grid.cell_spacing(level) / 2
+        return calibrated + self.evidence(torch.arange(self.count), rotations, blur).to(calibrated.dtype)
 
     def _learned_on_cells(self, grid: GridEmbeddings, level: int, cells: torch.Tensor) -> torch.Tensor:
         """What the network itself gives at every pair's own cells. (P, C) int64 -> (P, C)."""

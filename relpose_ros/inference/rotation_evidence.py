@@ -50,9 +50,9 @@ class _Shapes:
     """Peaks (P, M) as functions of a rotation's nine entries."""
 
     linear: torch.Tensor
-    """(P, M, 9) and"""
+    """(P, M, 9) coefficients of the entries in the squared distance from a peak, in standard deviations."""
     spread: torch.Tensor
-    """(P, M, 1): the squared distance in standard deviations is ``linear . entries + spread``."""
+    """(P, M, 1) what is added to that."""
     tops: torch.Tensor
     """(P, M, 1) logs of the densities at the peaks, times their probabilities."""
 

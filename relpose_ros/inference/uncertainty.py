@@ -74,10 +74,10 @@ def describe_pairs(
         by_weight = torch.argsort(weights, descending=True, stable=True)
         # Fitted where the network speaks alone; the width of a matched peak is fitted by itself.
         spoken = Evidence.GEOMETRIC in _evidence(energies, pair)
-        mode_spread = 1.0 if spoken else calibration.pair_spread
+        spread = 1.0 if spoken else calibration.pair_spread
         strongest = int(by_weight[0])
         told = by_weight[(weights[by_weight] >= LEAST_WEIGHT) | (by_weight == strongest)]
-        cores = _cores(distributions, pair, centres[told], basins[told]) * mode_spread
+        cores = _cores(distributions, pair, centres[told], basins[told]) * spread
         modes = tuple(
             Mode(camera_j_from_camera_i=centres[mode].numpy(), weight=float(weights[mode]), covariance=core)
             for mode, core in zip(told.tolist(), cores, strict=True)
@@ -89,8 +89,7 @@ def describe_pairs(
                 i=int(energies.i[pair]),
                 j=int(energies.j[pair]),
                 camera_j_from_camera_i=modes[0].camera_j_from_camera_i,
-                covariance=_second_moment(distributions, pair, centres[strongest], mass)
-                * calibration.pair_spread,
+                covariance=_second_moment(distributions, pair, centres[strongest], mass) * spread,
                 entropy=float(entropies[pair]),
                 probability_within_15_deg=_share(angles[:, strongest], mass, distributions.spacings),
                 modes=modes,

@@ -1,7 +1,7 @@
-"""The last part of the network, made ready for a solver that asks it for ten thousands of rotations.
+"""The last part of the network, made ready for a solver that asks it for tens of thousands of rotations.
 
 `RelPose.embed_relative` and `RelPose.pair_energies` say the same, to be trained. Here the weights are folded
-once, so that a call is a third of the operations: what counts for the few rotations of a step uphill. And
+once a scan, which saves operations: they are what a step uphill costs, of few rotations at a time. And the
 derivatives by the rotation are written out, which takes a third of what autograd takes.
 """
 
@@ -34,7 +34,7 @@ class EnergyHead:
         assert isinstance(last, nn.Linear)
         self._slope = activation.negative_slope
         with torch.no_grad():
-            entries = torch.eye(9, dtype=query.weight.dtype).view(9, 3, 3)
+            entries = torch.eye(9, dtype=query.weight.dtype, device=query.weight.device).view(9, 3, 3)
             released = conventions.released_relative(entries).flatten(1)
             # (9, 9 F): from the entries of a rotation to the angles whose sines and cosines are embedded.
             self._angles = (released[..., None] * network.embedding.flatten().to(released.dtype)).flatten(1)

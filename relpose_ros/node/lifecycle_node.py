@@ -52,6 +52,7 @@ from relpose_ros.node.reports import (
     qos_advice,
     twin_advice,
 )
+from relpose_ros.scanning.outgoing import TYPE_NAMES, estimate_message, markers, pose_array
 from relpose_ros.scanning.scanner import UNPAIRED_AFTER_S, Scanner
 from relpose_ros.scanning.settings import SettingsError
 
@@ -486,8 +487,6 @@ class ScanNode(LifecycleNode):
         return results
 
     def _publish(self, results: Sequence[Result]) -> None:
-        from relpose_ros.scanning.outgoing import estimate_message, markers, pose_array
-
         frame, types = self._settings.object_frame, _message_types()
         for result in results:
             if self._closing:
@@ -659,7 +658,5 @@ class ScanNode(LifecycleNode):
 
 @functools.cache
 def _message_types() -> dict[str, Any]:
-    from relpose_ros.scanning.outgoing import TYPE_NAMES
-
     parts = {name: name.split("/") for name in TYPE_NAMES}
     return {name: getattr(import_module(f"{part[0]}.msg"), part[2]) for name, part in parts.items()}

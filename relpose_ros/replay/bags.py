@@ -90,8 +90,8 @@ class Record(NamedTuple):
 class BagReader:
     """A bag opened for reading; use it as a context manager.
 
-    A recording that broke off (no metadata.yaml, an MCAP file without its end, a damaged database) is
-    read as far as it goes, with a warning in the log.
+    A recording that broke off (no metadata.yaml, an MCAP file without its end or without anything, a damaged
+    database) is read as far as it goes, with a warning in the log.
     """
 
     def __init__(self, path: Path) -> None:
@@ -146,8 +146,8 @@ class BagReader:
             if chosen
         ]
         for log_time, _, _, connection, data in heapq.merge(*streams, key=lambda item: item[:3]):
-            raw = zstd.decompress(data) if bytes(data[:4]) == ZSTD_MAGIC else data
             try:
+                raw = zstd.decompress(data) if bytes(data[:4]) == ZSTD_MAGIC else data
                 message = typestore.deserialize_cdr(raw, connection.msgtype)
             except Exception as err:  # the bytes are anybody's, and so are the errors they cause
                 self.unreadable[connection.topic] += 1
@@ -216,8 +216,16 @@ class BagReader:
                 how = f"'relpose_ros pack {self.path} --output BAG'"
                 text = f"{self.path} is a capture and no bag: {how} makes one of it."
             raise BagError(text)
+        problems = []
         for file in files:
-            self._open_file(file)
+            try:
+                self._open_file(file)
+            except BagError as err:
+                problems.append(err)
+        if not self._readers:
+            raise problems[0]
+        for problem in problems:
+            logger.warning("%s It is left out.", problem)
 
     def _open_file(self, path: Path) -> None:
         if path.stat().st_size == 0:

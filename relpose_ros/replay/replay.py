@@ -175,7 +175,7 @@ def _why_nothing(bag: Path, scanner: Scanner, rejected: Sequence[tuple[str, int]
     statistics = scanner.statistics()
     held = sum(scan.views for scan in statistics.scans.values())
     if statistics.failed:
-        return f"{bag} gave no estimate: {statistics.last_failure}."
+        return f"{bag} gave no estimate: {statistics.last_failure}"
     reasons = f"; {rejected[0][1]} messages were rejected, such as: {rejected[0][0]}" if rejected else "."
     if not held and not rejected and statistics.waiting:
         return (

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from relpose_ros.errors import RelPoseError
+from relpose_ros.geometry import so3
 from relpose_ros.scanning import image_decoding
 from relpose_ros.scanning.image_decoding import ImageError, Region
 from relpose_ros.scanning.settings import MAX_NAME_LENGTH
@@ -35,6 +36,9 @@ MIN_BOX_SIDE = 8
 
 MAX_FULL_SIDE = 2**16
 """Pixels: a larger full image is garbage."""
+
+SHORTEST_FOCAL = 0.05
+"""Of a focal length, in sides of the full image: no lens looks so wide, and a matrix in other units does."""
 
 QUATERNION_TOLERANCE = 0.01
 """How far from 1 a quaternion's length may be: rounded, not garbage."""
@@ -129,7 +133,7 @@ def view_from_object_view(message: Any, source: Source) -> View:
             if image_decoding.raw_size(mask) != picture.size:
                 text = f"the mask has {_size_text(image_decoding.raw_size(mask))} pixels"
                 raise source.rejection(f"{text}, the picture {_size_text(picture.size)}")
-        return _view(picture, origin, box, full, _intrinsics(message.k, source), decode_mask, source)
+        return _view(picture, origin, box, full, _intrinsics(message.k, full, source), decode_mask, source)
 
 
 def view_from_image(image: Any, info: Any, source: Source, rectification: str = "auto") -> View:
@@ -170,9 +174,12 @@ def view_from_image(image: Any, info: Any, source: Source, rectification: str = 
         named = RECTIFIED_TOPIC.search(source.topic) is not None
         rectified = rectification == "rectified" or (rectification == "auto" and named)
         if rectified and any(info.p):
-            intrinsics, distortion = _intrinsics(np.reshape(info.p, (3, 4))[:, :3].ravel(), source), None
+            intrinsics, distortion = (
+                _intrinsics(np.reshape(info.p, (3, 4))[:, :3].ravel(), full, source),
+                None,
+            )
         else:
-            intrinsics = _intrinsics(info.k, source)
+            intrinsics = _intrinsics(info.k, full, source)
             distortion = None if rectified or intrinsics is None else _distortion(info, source)
         return replace(_view(picture, origin, box, full, intrinsics, None, source), distortion=distortion)
 
@@ -189,8 +196,6 @@ def robot_pose(message: Any, source: Source, deviations: tuple[float, float]) ->
     Raises:
         ViewError: It is no pose, or its covariance none.
     """
-    from relpose_ros.geometry import so3  # it imports PyTorch, which takes a node's start seconds
-
     if not source.frame_id:
         raise source.rejection("frame_id is empty: it names the robot's frame in which the pose is")
     stated = getattr(message.pose, "covariance", None)
@@ -313,8 +318,8 @@ def _box_text(box: BoundingBox) -> str:
     return f"the box [{box.x0:.0f}, {box.y0:.0f}, {box.x1:.0f}, {box.y1:.0f}]"
 
 
-def _intrinsics(k: Any, source: Source) -> Intrinsics | None:
-    """From a row-major matrix K; None where it is all zero."""
+def _intrinsics(k: Any, size: tuple[int, int], source: Source) -> Intrinsics | None:
+    """From a row-major matrix K for pictures of a size; None where it is all zero."""
     matrix = np.asarray(k, np.float64)
     if not np.isfinite(matrix).all():
         raise source.rejection(f"the intrinsic matrix holds what is no number: {matrix.tolist()}")
@@ -323,6 +328,9 @@ def _intrinsics(k: Any, source: Source) -> Intrinsics | None:
     fx, fy, cx, cy = (float(matrix[index]) for index in (0, 4, 2, 5))
     if fx <= 0 or fy <= 0:
         raise source.rejection(f"the focal length in the intrinsic matrix is {fx}, {fy}: it must be positive")
+    if min(fx, fy) < SHORTEST_FOCAL * max(size):
+        text = f"the focal length in the intrinsic matrix is {fx}, {fy} for {_size_text(size)} pixels"
+        raise source.rejection(f"{text}: it must be in pixels")
     # ROS puts (0, 0) at the first pixel's centre, we at its outer corner.
     return Intrinsics(fx, fy, cx + 0.5, cy + 0.5)
 

@@ -27,6 +27,10 @@ SHORTEST_PAUSE_NS, LONGEST_PAUSE_NS = 200_000_000, 1_000_000_000
 pause doubles each time: a camera that stands still must not keep the estimator busy for ever, and one that
 moves on is soon tried again. By stamps, so that a replay does the same."""
 
+LONGEST_LAG_NS = 60 * 10**9
+"""No camera delivers later than this behind another one: what is further ahead of a view, and alone, may be a
+garbage stamp."""
+
 _SEEN = 64
 """Pictures remembered to tell one that comes raw and compressed: no transport lags by more."""
 
@@ -76,6 +80,8 @@ class ScanBuffer:
         self._on_trial: View | None = None
         self._pause_ns = self._paused_until_ns = 0
         self._newest_on: dict[str, int] = {}
+        self._newest_of: dict[tuple[str, str], int] = {}
+        """Of each camera: the same by topic and frame."""
         self._suspects: dict[str, list[View]] = {}
         """Views of one stamp on each topic, from cameras that are triggered together."""
         self._seen: deque[tuple[int, str, str]] = deque(maxlen=_SEEN)
@@ -101,7 +107,8 @@ class ScanBuffer:
         Saves decoding it.
         """
         newest_ns = self._newest_ns()
-        jumps = self._jumps_back(stamp_ns, topic) or self._confirms_jump(stamp_ns, frame_id, topic)
+        jumps = self._jumps_back(stamp_ns, frame_id, topic)
+        jumps |= self._confirms_jump(stamp_ns, frame_id, topic)
         if jumps or newest_ns is None:
             return None
         if (stamp_ns, frame_id, topic) in self._seen:
@@ -112,9 +119,9 @@ class ScanBuffer:
             return Decision(False, "a view with this stamp and frame was seen already")
         if stamp_ns < newest_ns:
             late = f"it is {(newest_ns - stamp_ns) / 1e9:.3f} s older than the scan of {self.object_id!r}"
-            return Decision(
-                False, f"{late}, whose newest view has stamp {stamp_text(newest_ns)}", rejected=True
-            )
+            newest = f"whose newest view has stamp {stamp_text(newest_ns)}"
+            order = "views of all cameras have to come in the order of their stamps"
+            return Decision(False, f"{late}, {newest}: {order}", rejected=True)
         full = len(self._views) >= self._settings.max_views
         if full and (self._settings.keep == "first" or self._is_paused(stamp_ns)):
             self._note_arrival(stamp_ns, frame_id, topic)
@@ -126,9 +133,11 @@ class ScanBuffer:
 
         Views of one stamp are two where their frames differ: of cameras that are triggered together.
 
-        A stamp far behind the last one on its topic is a garbage stamp or a clock that jumped backwards. The
-        next message on the topic tells which: if it is behind as well and in order, time did jump; or if both
-        repeat what was seen before, as in a bag too short for two messages far behind.
+        A stamp far behind the last one on its topic is a garbage stamp or a clock that jumped backwards,
+        unless it is ahead of the last one of its own camera, which is slow. The next message on the topic
+        tells which: if it is behind as well and in order, time did jump; or if both repeat what was seen
+        before, as in a bag too short for two messages far behind. Of a camera that is new on a topic of
+        others, only messages further apart than a jump tell: it may have begun with a few that were late.
         """
         declined = self.declines(view.stamp_ns, view.frame_id, topic)
         if declined is not None:
@@ -145,16 +154,13 @@ class ScanBuffer:
             for each, origin in together:
                 if not self._was_seen(each.stamp_ns, each.frame_id):
                     self._take(each, origin)
-        elif self._jumps_back(view.stamp_ns, topic):
-            others = [
-                each
-                for each in self._suspects.get(topic, ())
-                if each.stamp_ns == view.stamp_ns and each.frame_id != view.frame_id
-            ]
-            self._suspects[topic] = [*others, view]
-            behind = (self._newest_on[topic] - view.stamp_ns) / 1e9
-            text = f"it is {behind:.3f} s older than the last one on this topic: rejected unless the next "
-            return Decision(False, text + "one confirms that time jumped backwards", rejected=True)
+        elif self._jumps_back(view.stamp_ns, view.frame_id, topic):
+            self._suspect(view, topic)
+            newest_ns = self._newest_on.get(topic)
+            than = "the newest view" if newest_ns is None else "the last one on this topic"
+            behind = ((self._newest_ns() or 0) if newest_ns is None else newest_ns) - view.stamp_ns
+            text = f"it is {behind / 1e9:.3f} s older than {than}: rejected unless the next one"
+            return Decision(False, f"{text} confirms that time jumped backwards", rejected=True)
         return self._take(view, topic)
 
     def work(self) -> Work | None:
@@ -216,12 +222,15 @@ class ScanBuffer:
             self._decline()
 
     def drop_last(self) -> View | None:
-        """Forget the newest view and give it back; None where there is none."""
-        views = self._all()
-        if not views:
+        """Forget the newest view held and give it back; None where there is none.
+
+        Views whose place is not decided yet go too: one of them would take the room at once.
+        """
+        if not self._views:
             return None
-        self._forget(views[-1:])
-        return views[-1]
+        last = self._views[-1]
+        self._forget(self._all()[len(self._views) - 1 :])
+        return last
 
     def change_settings(self, settings: ScanSettings) -> None:
         """Go on with other settings; views that are too many now leave by the new keep policy."""
@@ -265,7 +274,7 @@ class ScanBuffer:
     def _note_arrival(self, stamp_ns: int, frame_id: str, topic: str) -> None:
         """Time goes on in this topic: whatever lay far behind was garbage."""
         self._seen.append((stamp_ns, frame_id, topic))
-        self._newest_on[topic] = stamp_ns
+        self._newest_on[topic] = self._newest_of[topic, frame_id] = stamp_ns
         self._suspects.pop(topic, None)
         # What is held, or a newcomer on trial, would wait for ever for an estimate that failed.
         self._changed |= self._failed
@@ -282,18 +291,37 @@ class ScanBuffer:
     def _is_paused(self, stamp_ns: int) -> bool:
         return self._settings.keep == "spread" and stamp_ns < self._paused_until_ns
 
-    def _jumps_back(self, stamp_ns: int, topic: str) -> bool:
-        # Each topic's own clock: another one may lag behind by more than any jump.
+    def _jumps_back(self, stamp_ns: int, frame_id: str, topic: str) -> bool:
+        own_ns = self._newest_of.get((topic, frame_id))
+        if own_ns is not None and own_ns < stamp_ns:
+            return False
+        # Each topic's own clock: another one may lag behind by more than any jump, but not by any time.
         newest_ns = self._newest_on.get(topic)
-        return newest_ns is not None and stamp_ns <= newest_ns - self._backward_jump_ns
+        if newest_ns is not None and stamp_ns <= newest_ns - self._backward_jump_ns:
+            return True
+        ahead = {view.stamp_ns for view in self._all() if view.stamp_ns > stamp_ns + LONGEST_LAG_NS}
+        return len(ahead) == 1
+
+    def _suspect(self, view: View, topic: str) -> None:
+        """Remember a view that may be the first after a jump, with those of its stamp."""
+        suspects = self._suspects.get(topic, [])
+        together = [each for each in suspects if each.stamp_ns == view.stamp_ns]
+        if suspects and not together and view.stamp_ns > suspects[0].stamp_ns:
+            return  # it is in order, but did not confirm the first yet
+        others = [each for each in together if each.frame_id != view.frame_id]
+        self._suspects[topic] = [*others, view]
 
     def _confirms_jump(self, stamp_ns: int, frame_id: str, topic: str) -> bool:
         suspects = self._suspects.get(topic)
         if not suspects or stamp_ns <= suspects[0].stamp_ns:
             return False
         first = suspects[0]
-        repeats = self._was_seen(first.stamp_ns, first.frame_id) and self._was_seen(stamp_ns, frame_id)
-        return repeats or self._jumps_back(stamp_ns, topic)
+        if self._was_seen(first.stamp_ns, first.frame_id) and self._was_seen(stamp_ns, frame_id):
+            return True
+        if not self._jumps_back(stamp_ns, frame_id, topic):
+            return False
+        is_new = topic in self._newest_on and (topic, frame_id) not in self._newest_of
+        return not is_new or stamp_ns >= first.stamp_ns + self._backward_jump_ns
 
     def _was_seen(self, stamp_ns: int, frame_id: str) -> bool:
         picture = stamp_ns, frame_id
@@ -316,6 +344,7 @@ class ScanBuffer:
             _logger.warning(text, newest, stamp, self.object_id)
             self._forget(views)
         self._newest_on.clear()
+        self._newest_of.clear()
         self._suspects.clear()
         self._seen.clear()
 
@@ -330,6 +359,7 @@ class ScanBuffer:
         self._changed, self._base = True, None
         if not left:
             self._newest_on.clear()
+            self._newest_of.clear()
             self._suspects.clear()
 
     def _all(self) -> list[View]:

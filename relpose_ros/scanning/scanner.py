@@ -457,7 +457,8 @@ class Scanner:
                     words = without_room(estimate.status, self._settings.keep)
                     estimate = replace(estimate, status=words)
             except Exception as err:
-                text = f"The estimate of {scan.object_id!r} from {len(scan.views)} views failed: {err}."
+                what = f"The estimate of {scan.object_id!r} from {len(scan.views)} views"
+                text = f"{what} failed: {str(err).rstrip('.')}."
                 # A sentence for the user needs no traceback, a defect does.
                 trace = not isinstance(err, RelPoseError)
                 _logger.error("%s The views are kept.", text, exc_info=trace)

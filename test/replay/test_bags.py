@@ -95,6 +95,18 @@ def test_files_of_a_recording_without_metadata_are_merged(tmp_path: Path) -> Non
     assert read(tmp_path / "bag", ["/a", "/b"]) == IN_LOG_ORDER
 
 
+@pytest.mark.parametrize("last", [b"", b"\x89MCAP0\r\n" + bytes(50)])
+def test_a_recording_whose_last_file_came_to_nothing_is_read_without_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, last: bytes
+) -> None:
+    write_strings(tmp_path / "bag", TIMES)
+    (tmp_path / "bag/metadata.yaml").unlink()
+    (tmp_path / "bag/bag_1.mcap").write_bytes(last)
+    assert read(tmp_path / "bag", ["/a", "/b"]) == IN_LOG_ORDER
+    assert "bag_1.mcap" in caplog.text
+    assert "It is left out." in caplog.text
+
+
 @pytest.mark.parametrize("with_metadata", [False, True])
 def test_a_cut_mcap_file_gives_what_came_before_the_cut(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, with_metadata: bool
@@ -144,7 +156,7 @@ def test_a_message_that_is_not_what_its_type_says_is_left_out(
         connection = writer.add_connection("/a", STRING, typestore=JAZZY)
         writer.write(connection, 1, JAZZY.serialize_cdr(JAZZY.types[STRING](data="/a 1 "), STRING))
         writer.write(connection, 2, b"\x00\x01\x00\x00\xff\xff\xff\x7fabc")
-        writer.write(connection, 3, b"")
+        writer.write(connection, 3, b"\x28\xb5\x2f\xfd no message that zstd packed")
         writer.write(connection, 4, JAZZY.serialize_cdr(JAZZY.types[STRING](data="/a 4 "), STRING))
     with BagReader(tmp_path / "bag") as bag, caplog.at_level(logging.WARNING, "relpose_ros"):
         assert [record.log_time_ns for record in bag.records(["/a"])] == [1, 4]

@@ -183,11 +183,52 @@ def test_a_late_view_is_rejected_and_so_is_a_repeated_stamp(keep: str) -> None:
     assert repeated.rejected
     assert "give each picture its own stamp, and each camera its own frame_id" in repeated.reason
     assert late.rejected
-    assert (
-        late.reason == "it is 0.300 s older than the scan of 'mug', whose newest view has stamp 1.500000000"
+    assert late.reason == (
+        "it is 0.300 s older than the scan of 'mug', whose newest view has stamp 1.500000000: "
+        "views of all cameras have to come in the order of their stamps"
     )
     assert good.accepted
     assert stamps_of(buffer) == [1.0, 1.5, 1.6]
+
+
+def test_a_camera_that_lags_behind_another_on_its_topic_is_no_jump() -> None:
+    """Its own clock goes on; what it sends first may be late, several in a row."""
+    buffer = ScanBuffer("mug", ScanSettings())
+    for stamp in (100, 100.5, 101, 102.5):
+        assert buffer.add(view(stamp, "left"), "a").accepted
+    late = [buffer.add(view(stamp, "right"), "a") for stamp in (101.0, 101.4)]
+    assert all(each.rejected for each in late)
+    assert buffer.add(view(102.6, "right"), "a").accepted
+    assert buffer.add(view(105, "left"), "a").accepted
+    assert all(buffer.add(view(stamp, "right"), "a").rejected for stamp in (103, 103.5))
+    assert stamps_of(buffer) == [100, 100.5, 101, 102.5, 102.6, 105]
+
+
+def test_another_camera_tells_of_a_jump_by_more_than_a_moment() -> None:
+    """A bag of long ago is played on the same topic: no frame of it is known."""
+    buffer = ScanBuffer("mug", ScanSettings())
+    for stamp in (100, 101):
+        assert buffer.add(view(stamp, "left"), "a").accepted
+    decisions = [buffer.add(view(stamp, f"frame {stamp}"), "a") for stamp in (10, 10.4, 10.8, 11.2)]
+    assert [each.accepted for each in decisions] == [False, False, False, True]
+    assert stamps_of(buffer) == [10, 11.2]
+
+
+def test_a_garbage_stamp_on_one_topic_does_not_block_the_others(caplog: pytest.LogCaptureFixture) -> None:
+    buffer = buffer_with(1, 2, 1e6)
+    first, second, third = add(buffer, 3, 4, 5, topic="b")
+    assert first.rejected
+    assert first.reason.startswith("it is 999997.000 s older than the newest view")
+    assert second.accepted
+    assert third.accepted
+    assert stamps_of(buffer) == [1, 2, 3, 4, 5]
+    assert "stamp 1000000.000000000 is dropped" in caplog.text
+
+
+def test_a_topic_whose_clock_is_another_takes_nothing_away() -> None:
+    buffer = buffer_with(1000, 1001)
+    assert all(each.rejected for each in add(buffer, 3, 4, 5, topic="b"))
+    assert stamps_of(buffer) == [1000, 1001]
 
 
 @pytest.mark.parametrize("garbage", [0.0, 2.0, 7.9])
@@ -345,20 +386,22 @@ def test_an_estimate_of_views_forgotten_meanwhile_does_not_stand(
     assert buffer.has_work()
 
 
-def test_a_newcomer_on_trial_survives_when_another_view_is_dropped(
-    circle_estimator: Callable[..., Any],
-) -> None:
+def test_what_is_dropped_of_a_full_scan_makes_room(circle_estimator: Callable[..., Any]) -> None:
+    """Newcomers whose place is not decided yet would take it at once."""
     buffer = buffer_with(1, 2, 3, keep="spread", max_views=3)
     estimate_all(buffer, circle_estimator())
     add(buffer, 9, 10)
     work = buffer.work()
     assert work is not None
     assert work.newcomer is not None
-    assert buffer.drop_last() is not None
+    dropped = buffer.drop_last()
+    assert dropped is not None
+    assert dropped.stamp_ns == 3 * SECOND
     assert not buffer.settle(work, circle_estimator().estimate(Scan("mug", work.views)))
     estimate_all(buffer, circle_estimator())
-    assert 9 in stamps_of(buffer)
-    assert 10 not in stamps_of(buffer)
+    assert stamps_of(buffer) == [1, 2]
+    add(buffer, 11)
+    assert stamps_of(buffer) == [1, 2, 11]
 
 
 def test_views_that_come_while_an_estimate_is_made_are_taken_together(
