@@ -301,6 +301,11 @@ def _parser() -> argparse.ArgumentParser:
         help="cpu (default), cuda, cuda:1 ... Several processes: start with torchrun",
     )
     train.add_argument(
+        "--precision",
+        choices=("float32", "bfloat16", "float16"),
+        help="of the forward pass, energies aside (default: bfloat16 for paper, float32 for compact)",
+    )
+    train.add_argument(
         "--workers",
         type=int,
         default=0,
@@ -571,6 +576,8 @@ def _train(arguments: argparse.Namespace) -> int:
     settings = replace(settings_for(arguments.preset, arguments.variant), seed=arguments.seed)
     if arguments.images:
         settings = replace(settings, images=arguments.images)
+    if arguments.precision:
+        settings = replace(settings, precision=arguments.precision)
     held_out = open_scans(arguments.held_out) if arguments.held_out else None
     scans = open_scans(arguments.scans)
     trainer = Trainer(

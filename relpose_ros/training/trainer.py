@@ -226,6 +226,8 @@ class Trainer:
         self._began: int | None = None
         """Images that the weights had seen which were given to begin with; None: they were random."""
         self._seconds = 0.0
+        self._unlogged: list[torch.Tensor] = []
+        """Losses of the steps since the curve's latest row."""
         if goes_on:
             self._resume()
         elif start_from is not None:
@@ -256,19 +258,18 @@ class Trainer:
 
         started = time.monotonic()
         before = self._seconds
-        losses: list[torch.Tensor] = []
         last = (self.images, started)
         hidden = not progress or self._rank > 0
         with tqdm(total=self.settings.images, initial=self.images, unit="image", disable=hidden) as bar:
             while not self.finished and not self._out_of_time(started, budget_s):
                 was = self.images
-                losses.append(self.train_step())
+                self.train_step()
                 bar.update(self.images - was)
                 self._seconds = before + time.monotonic() - started
                 check = self.step % check_every == 0
                 if self.step % log_every == 0 or check:
-                    means = torch.stack(losses).mean(0).tolist()
-                    losses.clear()
+                    means = torch.stack(self._unlogged).mean(0).tolist()
+                    self._unlogged.clear()
                     now = time.monotonic()
                     speed = (self.images - last[0]) / (now - last[1])
                     last = (self.images, now)
@@ -301,6 +302,7 @@ class Trainer:
             keep = min(self.step / (self.step + 10), keep)
         with torch.no_grad():
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - keep)
+        self._unlogged.append(losses.detach())
         return losses.detach()
 
     def learning_rate(self) -> float:
@@ -332,6 +334,7 @@ class Trainer:
                 "images": self.images,
                 "began": self._began,
                 "seconds": self._seconds,
+                "unlogged": self._unlogged,
                 "preset": asdict(self.settings.network),
             }
             save_pieces(state, self.folder)
@@ -365,6 +368,7 @@ class Trainer:
         self._scaler.load_state_dict(state["scaler"])
         self.step, self.images, self._seconds = state["step"], state["images"], state["seconds"]
         self._began = state.get("began")  # missing in files of before it could be anything but random
+        self._unlogged = list(state.get("unlogged", []))
         if self._rank == 0:
             _cut_curve(self.folder / CURVE, self.step)
 
