@@ -17,7 +17,8 @@ which flatters it.
 the solver's joint score with that of a slow, dense search, for so many random scans of 2 to 8 views: some
 seconds each.
 
-Each preset runs in a process of its own, whose peak memory is then that of the largest N so far.
+Each preset runs in a process of its own, whose peak memory is then that of the largest N so far; the
+published procedure is priced in another one.
 """
 
 from __future__ import annotations
@@ -115,25 +116,21 @@ def spread(seconds: list[float]) -> tuple[float, float]:
 
 
 @torch.no_grad()
-def rows(name: str, repeats: int, scale: float) -> None:
+def rows(name: str, repeats: int, per_evaluation: float) -> None:
     """Prints the rows of one preset."""
     network = peaked_network(name, 0)
-    size = network.preset.image_size
-    images = torch.randn(MAX_VIEWS, 3, size, size, generator=torch.Generator().manual_seed(0))
-    crops = torch.rand(MAX_VIEWS, 3, generator=torch.Generator().manual_seed(1))
+    images, crops = inputs(network, MAX_VIEWS)
     views = noise_views(MAX_VIEWS)
     counts = range(MIN_VIEWS, MAX_VIEWS + 1)
-    with tqdm(total=1 + 2 * len(counts), desc=f"{name}, published procedure", leave=False) as bar:
-        per_evaluation = price(network, images[:3], crops[:3], scale)
-        bar.update()
+    with tqdm(total=2 * len(counts), leave=False) as bar:
         for kind in ("contradict", "agree"):
             if kind == "agree":
                 network.layers[4].weight *= 0.01
             estimator = Estimator(network, evidence=EvidenceSettings(use="network"))
-            estimator.estimate(Scan("warm-up", tuple(fresh(views))))
             totals = []
             for count in counts:
                 bar.set_description(f"{name}, {kind}, N = {count}")
+                estimator.estimate(Scan("warm-up", tuple(fresh(views[:count]))))
 
                 def encode(count: int = count) -> object:
                     looks = [network.look(images[view : view + 1])[0] for view in range(count)]
@@ -172,8 +169,19 @@ def estimated(
     return spread(whole), spread(more)
 
 
-def price(network: RelPose, images: torch.Tensor, crops: torch.Tensor, scale: float) -> float:
+def inputs(network: RelPose, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Crops of noise, and where they lie."""
+    size = network.preset.image_size
+    images = torch.randn(MAX_VIEWS, 3, size, size, generator=torch.Generator().manual_seed(0))
+    crops = torch.rand(MAX_VIEWS, 3, generator=torch.Generator().manual_seed(1))
+    return images[:count], crops[:count]
+
+
+@torch.no_grad()
+def price(name: str, scale: float) -> float:
     """Seconds per evaluated energy in the published procedure, from a run with three views."""
+    network = peaked_network(name, 0)
+    images, crops = inputs(network, 3)
     features = network.relate(network.look(images), crops)
     energies = PairEnergies.of(network, features, len(images))
     start = time.perf_counter()
@@ -252,14 +260,20 @@ def main() -> None:
     parser.add_argument(
         "--recipes", type=int, metavar="K", help="only the comparison with the exhaustive reference"
     )
-    parser.add_argument("--rows", action="store_true", help="the rows of the presets, in this process")
+    parser.add_argument("--price", action="store_true", help="only the price of an evaluation, in seconds")
+    parser.add_argument(
+        "--rows", type=float, metavar="PRICE", help="only the rows of the presets, in this process"
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     if not 0 < arguments.published_scale <= 1:
         parser.error(f"--published-scale is a share above 0 and up to 1, not {arguments.published_scale}")
+    if arguments.price:
+        print(*(price(name, arguments.published_scale) for name in arguments.presets))
+        return
     if arguments.rows:
         for name in arguments.presets:
-            rows(name, arguments.repeats, arguments.published_scale)
+            rows(name, arguments.repeats, arguments.rows)
         return
     print(f"torch {torch.__version__}, {platform.machine()}, {arguments.threads} threads, float32")
     if arguments.recipes:
@@ -271,9 +285,12 @@ def main() -> None:
             print(f"published procedure priced on {arguments.published_scale:.0%} of its proposals")
         print(f"\n{HEADER}", flush=True)
         for name in arguments.presets:
-            own = [sys.executable, "-m", "benchmarks.solver", "--rows", "--presets", name]
+            own = [sys.executable, "-m", "benchmarks.solver", "--presets", name]
             own += ["--threads", str(arguments.threads), "--repeats", str(arguments.repeats)]
-            subprocess.run([*own, "--published-scale", str(arguments.published_scale)], check=True)
+            print(f"{name}: pricing the published procedure", file=sys.stderr)
+            pricing = [*own, "--price", "--published-scale", str(arguments.published_scale)]
+            priced = subprocess.run(pricing, check=True, capture_output=True, text=True).stdout
+            subprocess.run([*own, "--rows", priced.strip()], check=True)
     search_table(arguments.pairs)
 
 
