@@ -14,14 +14,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from relpose_ros.geometry import so3, so3_grid
-from relpose_ros.inference.pair_distribution import ascend, peaks, pick, turned
+from relpose_ros.inference.moving_cameras import MovingCameras
+from relpose_ros.inference.pair_distribution import ascend, peaks, pick, turned, turned_back
 
 if TYPE_CHECKING:
     from relpose_ros.inference.pair_distribution import PairDistributions
@@ -111,7 +112,7 @@ def joint_uphill(energies: PairEnergies, rotations: torch.Tensor) -> tuple[torch
     # A turn w of camera i turns the pair by -R_ji w.
     by_camera = torch.zeros(energies.views, len(rotations), 3, dtype=torch.float64)
     by_camera.index_add_(0, energies.j, slopes)
-    by_camera.index_add_(0, energies.i, _turned_back(relative, slopes))
+    by_camera.index_add_(0, energies.i, turned_back(relative, slopes))
     return values.sum(0), by_camera.transpose(0, 1)
 
 
@@ -119,11 +120,6 @@ def _all_relative(energies: PairEnergies, rotations: torch.Tensor) -> torch.Tens
     """Each pair's relative rotation. (S, N, 3, 3) -> (P, S, 3, 3)."""
     cameras = rotations.transpose(0, 1)
     return cameras[energies.j] @ cameras[energies.i].mT
-
-
-def _turned_back(relative: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:
-    """From slopes for ``exp(w) R`` to those for ``R exp(-w)``. (..., 3, 3), (..., 3) -> (..., 3)."""
-    return -(slopes[..., None, :] @ relative)[..., 0, :]
 
 
 def solve(
@@ -304,116 +300,21 @@ def _grow(
     trees = torch.arange(len(beams))[:, None]
     for position in range(placed, energies.views):
         cameras, others = orders[:, position], orders[:, :position]
-        modes = distributions.modes[:, : settings.modes]
-        candidates = _mode_candidates(energies, modes, beams, cameras, others)  # (T, B, C, 3, 3)
-        guesses = scores[..., None] + _remembered(energies, distributions, beams, cameras, others, candidates)
+        joining = MovingCameras(energies, beams, cameras, others)
+        candidates = joining.where_modes_put(distributions.modes[:, : settings.modes])  # (T, B, C, 3, 3)
+        guesses = scores[..., None] + joining.remembered(distributions, candidates)
         # Lower modes beside higher ones come last, where there is still room.
-        heights = distributions.mode_energies[energies.pair_of[cameras[:, None], others], : settings.modes]
+        heights = distributions.mode_energies[joining.pairs, : settings.modes]
         guesses = guesses.masked_fill((heights == -math.inf).flatten(1)[:, None], -math.inf).flatten(1)
         chosen = guesses.sort(dim=1, descending=True, stable=True).indices[:, : settings.screened * width]
         parents, places = chosen // candidates.shape[2], pick(candidates.flatten(1, 2), chosen)
-        gains = _conditional(energies, beams[trees, parents], cameras, others, places[:, :, None])[..., 0]
-        totals = scores.gather(1, parents) + gains
         beams = beams[trees, parents]
+        gains = replace(joining, rotations=beams).heights(places[:, :, None])[..., 0]
+        totals = scores.gather(1, parents) + gains
         beams[trees, torch.arange(chosen.shape[1]), cameras[:, None]] = places
         keep, scores = peaks(beams, totals, width, settings.distinct)
         beams = beams[trees, keep]
     return beams[scores > -math.inf]
-
-
-def _mode_candidates(
-    energies: PairEnergies,
-    modes: torch.Tensor,
-    rotations: torch.Tensor,
-    cameras: torch.Tensor,
-    others: torch.Tensor,
-) -> torch.Tensor:
-    """Where modes (P, M, 3, 3) of its pairs would put a camera; see `_conditional`. -> (G, S, C, 3, 3)."""
-    modes = modes[energies.pair_of[cameras[:, None], others]]  # (G, O, M, 3, 3)
-    forward = (cameras[:, None] > others)[..., None, None, None]
-    camera_from_other = torch.where(forward, modes, modes.mT)[:, None]
-    placed = rotations[torch.arange(len(cameras))[:, None], :, others].transpose(1, 2)
-    return (camera_from_other @ placed[:, :, :, None]).flatten(2, 3)
-
-
-def _relative(
-    rotations: torch.Tensor, cameras: torch.Tensor, others: torch.Tensor, candidates: torch.Tensor
-) -> torch.Tensor:
-    """Relative rotations of a camera's pairs, each in the order of its views; see `_conditional`.
-
-    -> (G, O, S, C, 3, 3).
-    """
-    placed = rotations[torch.arange(len(cameras))[:, None], :, others]  # (G, O, S, 3, 3)
-    groups, solutions, count = candidates.shape[:3]
-    # One product of a tall and a wide matrix for each group and solution, of whose tiles each is a rotation.
-    wide = placed.permute(0, 2, 4, 1, 3).flatten(3)  # (G, S, 3, 3 O)
-    tiles = (candidates.flatten(2, 3) @ wide).view(groups, solutions, count, 3, -1, 3)
-    camera_from_other = tiles.permute(0, 4, 1, 2, 3, 5)
-    forward = (cameras[:, None] > others)[..., None, None, None, None]
-    return torch.where(forward, camera_from_other, camera_from_other.mT)
-
-
-def _conditional(
-    energies: PairEnergies,
-    rotations: torch.Tensor,
-    cameras: torch.Tensor,
-    others: torch.Tensor,
-    candidates: torch.Tensor,
-) -> torch.Tensor:
-    """Energy of one camera's pairs at each candidate, the others held.
-
-    Args:
-        energies: of the scan.
-        rotations: (G, S, N, 3, 3).
-        cameras: (G,), the camera of each group.
-        others: (G, O), those that hold it.
-        candidates: (G, S, C, 3, 3).
-
-    Returns:
-        (G, S, C) float64.
-    """
-    relative = _relative(rotations, cameras, others, candidates)
-    pairs = energies.pair_of[cameras[:, None], others].flatten()
-    values = energies.at(pairs, relative.flatten(2, 3).flatten(0, 1))
-    return values.double().view(relative.shape[:4]).sum(1)
-
-
-def _conditional_uphill(
-    energies: PairEnergies,
-    rotations: torch.Tensor,
-    cameras: torch.Tensor,
-    others: torch.Tensor,
-    candidates: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """`_conditional`, and its gradients for left perturbations of the candidates. -> (G, S, C), (..., 3)."""
-    relative = _relative(rotations, cameras, others, candidates)
-    pairs = energies.pair_of[cameras[:, None], others].flatten()
-    values, slopes = energies.uphill(pairs, relative.flatten(2, 3).flatten(0, 1))
-    slopes = slopes.view(relative.shape[:-1])
-    forward = (cameras[:, None] > others)[..., None, None, None]
-    slopes = torch.where(forward, slopes, _turned_back(relative, slopes))
-    return values.view(relative.shape[:4]).sum(1), slopes.sum(1)
-
-
-def _remembered(
-    energies: PairEnergies,
-    distributions: PairDistributions,
-    rotations: torch.Tensor,
-    cameras: torch.Tensor,
-    others: torch.Tensor,
-    candidates: torch.Tensor,
-) -> torch.Tensor:
-    """What the coarse grid remembers of `_conditional`; no energy is evaluated. -> (G, S, C)."""
-    relative = _relative(rotations, cameras, others, candidates)
-    cells = torch.from_numpy(so3_grid.cells_at(distributions.coarse_level, relative.numpy()))
-    known = distributions.coarse[energies.pair_of[cameras[:, None], others]]  # (G, O, cells)
-    return known.gather(2, cells.flatten(2)).view(cells.shape).sum(1)
-
-
-def _others(views: int) -> torch.Tensor:
-    """(N, N - 1): beside each camera all others."""
-    cameras = torch.arange(views)
-    return cameras.expand(views, -1)[cameras != cameras[:, None]].view(views, views - 1)
 
 
 def _neighbourhood() -> torch.Tensor:
@@ -441,52 +342,36 @@ def _jumped(
     Modes of its pairs and cells of the coarse grid only say where to start climbing: what all pairs of a
     camera agree on may be the top of none of them.
     """
-    cameras, others = torch.arange(energies.views), _others(energies.views)
-    every, here = _each_camera(rotations, cameras)
-    now = _conditional(energies, every, cameras, others, here)
-    ceilings = tops[energies.pair_of[cameras[:, None], others]].sum(1)
-    restless = ceilings - now.amin((1, 2)) > settings.content * others.shape[1]
+    moving = MovingCameras.each(energies, rotations)
+    now = moving.heights(moving.here)
+    restless = tops[moving.pairs].sum(1) - now.amin((1, 2)) > settings.content * (energies.views - 1)
     if not restless.any():
         return rotations
-    cameras, others, every, here, now = (each[restless] for each in (cameras, others, every, here, now))
+    moving, now = moving.only(restless), now[restless]
     cells = torch.from_numpy(np.array(so3_grid.grid(distributions.coarse_level)))
-    modes = _mode_candidates(energies, distributions.modes, every, cameras, others)
-    places = torch.cat([modes, cells.expand(*every.shape[:2], -1, -1, -1)], 2)
-    guesses = _remembered(energies, distributions, every, cameras, others, places)
+    modes = moving.where_modes_put(distributions.modes)
+    places = torch.cat([modes, cells.expand(*modes.shape[:2], -1, -1, -1)], 2)
+    guesses = moving.remembered(distributions, places)
     places = _highest(places, guesses, settings.many(settings.hops, energies.count), settings.distinct)
-    gains = _conditional(energies, every, cameras, others, places)
-    starts = _highest(places, gains, settings.many(settings.hills, energies.count), settings.distinct)
-
+    hills = settings.many(settings.hills, energies.count)
+    starts = _highest(places, moving.heights(places), hills, settings.distinct)
     strides = torch.full(starts.shape[:3], settings.hop_stride, dtype=torch.float64)
-    hills, heights = ascend(
-        lambda places: _conditional_uphill(energies, every, cameras, others, places),
-        starts,
-        strides,
-        settings.hop_steps,
-    )
-    places = torch.cat([here, hills], 2)
-    heights = torch.cat([now, heights], 2)
-    return _moved(rotations, cameras, places, heights).flatten(0, 1)
+    tops_of_hills, heights = ascend(moving.uphill, starts, strides, settings.hop_steps)
+    places, heights = torch.cat([moving.here, tops_of_hills], 2), torch.cat([now, heights], 2)
+    return _moved(rotations, moving.cameras, places, heights).flatten(0, 1)
 
 
-def _swept(energies: PairEnergies, rotations: torch.Tensor, radius: float, turn: float = 0.0) -> torch.Tensor:
+def _swept(energies: PairEnergies, rotations: torch.Tensor, radius: float, phase: float) -> torch.Tensor:
     """Moves cameras to the best places around them. (S, N, 3, 3) -> (S, N, 3, 3).
 
-    Places lie at other directions for another ``turn``, rad.
+    Places lie in other directions for another ``phase``, rad.
     """
-    cameras, others = torch.arange(energies.views), _others(energies.views)
-    directions = _NEIGHBOURHOOD @ torch.from_numpy(so3.exp([turn, turn, 0.0]))
-    every, here = _each_camera(rotations, cameras)
-    places = turned(here, directions * radius)  # the first is where the camera is
-    heights = _conditional(energies, every, cameras, others, places)
-    moved = _moved(rotations, cameras, places, heights)
+    moving = MovingCameras.each(energies, rotations)
+    directions = _NEIGHBOURHOOD @ torch.from_numpy(so3.exp([phase, phase, 0.0]))
+    places = turned(moving.here, directions * radius)  # the first is where the camera is
+    moved = _moved(rotations, moving.cameras, places, moving.heights(places))
     scores = joint_scores(energies, moved.flatten(0, 1)).view(moved.shape[:2])
     return moved[torch.arange(len(moved)), scores.argmax(1)]
-
-
-def _each_camera(rotations: torch.Tensor, cameras: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Solutions once for each camera, and where it is. (S, N, 3, 3) -> (G, S, N, 3, 3), (G, S, 1, 3, 3)."""
-    return rotations.expand(len(cameras), -1, -1, -1, -1), rotations[:, cameras].transpose(0, 1)[:, :, None]
 
 
 def _highest(places: torch.Tensor, values: torch.Tensor, count: int, angle: float) -> torch.Tensor:

@@ -223,3 +223,8 @@ def ascend(
 def turned(rotations: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
     """``exp(w) R``. (..., 3, 3), (..., 3) -> (..., 3, 3)."""
     return torch.from_numpy(so3.exp(vectors.numpy())) @ rotations
+
+
+def turned_back(rotations: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:
+    """From slopes for ``exp(w) R`` to those for ``R exp(-w)``. (..., 3, 3), (..., 3) -> (..., 3)."""
+    return -(slopes[..., None, :] @ rotations)[..., 0, :]
