@@ -39,7 +39,7 @@ def baseline(
     camera_from_object: FloatArray,
     direction: FloatArray,
     covariance: FloatArray,
-    turn: FloatArray,
+    rotation_covariance: FloatArray,
 ) -> Baseline:
     """From a relative pose's translation.
 
@@ -49,11 +49,11 @@ def baseline(
         camera_from_object: (3, 3) rotation of camera j.
         direction: (3,) unit translation of camera_j_from_camera_i: where camera i stands, seen from j.
         covariance: (3, 3) of it.
-        turn: (3, 3) covariance of camera j's rotation in the object frame, rad^2: it turns the direction too.
+        rotation_covariance: (3, 3) of camera j, in the object frame, rad^2: it turns the direction too.
     """
     towards = -camera_from_object.T @ direction
     across = np.eye(3) - np.outer(towards, towards)
-    swing = np.trace(across @ turn) / 2 * across
+    swing = np.trace(across @ rotation_covariance) / 2 * across
     return Baseline(i, j, towards, camera_from_object.T @ covariance @ camera_from_object + swing)
 
 

@@ -22,7 +22,7 @@ import torch
 
 from relpose_ros.geometry import so3, so3_grid
 from relpose_ros.inference.moving_cameras import MovingCameras
-from relpose_ros.inference.pair_distribution import ascend, peaks, pick, turned, turned_back
+from relpose_ros.inference.pair_distribution import ascend, highest_apart, pick, turned, turned_back
 
 if TYPE_CHECKING:
     from relpose_ros.inference.pair_distribution import PairDistributions
@@ -221,7 +221,7 @@ def _best(
     -> (<= count, N, 3, 3), (<= count,).
     """
     rotations = rotations @ rotations[:, :1].mT
-    keep, scores = peaks(rotations[None], joint_scores(energies, rotations)[None], count, angle)
+    keep, scores = highest_apart(rotations[None], joint_scores(energies, rotations)[None], count, angle)
     found = scores[0] > -math.inf
     return rotations[keep[0, found]], scores[0, found]
 
@@ -312,7 +312,7 @@ def _grow(
         gains = replace(joining, rotations=beams).heights(places[:, :, None])[..., 0]
         totals = scores.gather(1, parents) + gains
         beams[trees, torch.arange(chosen.shape[1]), cameras[:, None]] = places
-        keep, scores = peaks(beams, totals, width, settings.distinct)
+        keep, scores = highest_apart(beams, totals, width, settings.distinct)
         beams = beams[trees, keep]
     return beams[scores > -math.inf]
 
@@ -377,7 +377,7 @@ def _swept(energies: PairEnergies, rotations: torch.Tensor, radius: float, phase
 def _highest(places: torch.Tensor, values: torch.Tensor, count: int, angle: float) -> torch.Tensor:
     """The best distinct ones of a camera's places. (G, S, C, 3, 3), (G, S, C) -> (G, S, <= count, 3, 3)."""
     flat = places.flatten(0, 1)
-    kept = pick(flat, peaks(flat, values.flatten(0, 1), count, angle)[0])
+    kept = pick(flat, highest_apart(flat, values.flatten(0, 1), count, angle)[0])
     return kept.view(*places.shape[:2], -1, 3, 3)
 
 

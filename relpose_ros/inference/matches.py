@@ -75,7 +75,7 @@ SEPARATION = math.radians(5)
 TEMPER = 5.0
 """Divisor of an explanation's cost: errors of features near each other go together, and of two explanations
 the better one is often the wrong one by a hair. Fitted: the right one's likelihood is highest with it."""
-LEAST_WEIGHT = 0.03
+LEAST_POSE_WEIGHT = 0.03
 """Of an explanation that is worth telling, relative to the best."""
 MOST_EXPLANATIONS = 4
 """More say hardly anything, and each costs the solver time."""
@@ -244,7 +244,7 @@ def _distinct(poses: Poses, costs: FloatArray) -> tuple[Poses, FloatArray]:
     kept: list[int] = []
     for k in np.argsort(costs, kind="stable").tolist():
         apart = so3.angle_between(poses.rotations[kept], poses.rotations[k])
-        if likelihoods[k] > LEAST_WEIGHT and (apart > SEPARATION).all():
+        if likelihoods[k] > LEAST_POSE_WEIGHT and (apart > SEPARATION).all():
             kept.append(k)
     weights = likelihoods[kept] / likelihoods[kept].sum()
     return poses[np.array(kept[:MOST_EXPLANATIONS])], weights[:MOST_EXPLANATIONS]

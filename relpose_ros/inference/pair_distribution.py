@@ -114,7 +114,7 @@ def search(
     levels = [at for at, index, _ in kept for _ in range(index.shape[1])]
     log_volumes = torch.tensor([-math.log(so3_grid.size(at)) for at in levels], dtype=torch.float64)
     spacings = torch.tensor([so3_grid.cell_spacing(at) for at in levels], dtype=torch.float64)
-    tops, heights = peaks(rotations, blurred, settings.modes, settings.separation)
+    tops, heights = highest_apart(rotations, blurred, settings.modes, settings.separation)
     modes, mode_energies = _refine_modes(
         energies, pick(rotations, tops), heights, spacings[tops] / 2, settings
     )
@@ -133,7 +133,7 @@ def pick(rotations: torch.Tensor, positions: torch.Tensor) -> torch.Tensor:
     return torch.gather(rotations, 1, positions[..., None, None].expand(-1, -1, 3, 3))
 
 
-def peaks(
+def highest_apart(
     rotations: torch.Tensor, values: torch.Tensor, count: int, separation: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The highest of some rotations, in each row, of which no two are nearer than ``separation``.

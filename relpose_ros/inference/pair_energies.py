@@ -35,7 +35,7 @@ ROWS = 2048
 between layers."""
 
 
-class EnergyHead(Protocol):
+class ScoresRotations(Protocol):
     """The part of a network that scores relative rotations; see `relpose_ros.network.energy_head`."""
 
     def embed(self, rotations: torch.Tensor) -> torch.Tensor:
@@ -60,7 +60,7 @@ class EnergyModel(Protocol):
         """What a pair contributes before a rotation is known. (P,), (P,) view positions -> (P, H)."""
         ...
 
-    def energy_head(self) -> EnergyHead:
+    def energy_head(self) -> ScoresRotations:
         """What scores rotations, given those."""
         ...
 
@@ -76,7 +76,7 @@ class GridEmbeddings:
         self._levels: dict[int, torch.Tensor] = {}
 
     @cached_property
-    def _head(self) -> EnergyHead:
+    def _head(self) -> ScoresRotations:
         """Made when it is first asked for: a network that regresses rotations has none."""
         return self._model.energy_head()
 
@@ -100,7 +100,7 @@ class GridEmbeddings:
 class PairEnergies:
     """All unordered pairs of N views, each scored once with i < j."""
 
-    head: EnergyHead
+    head: ScoresRotations
     contexts: torch.Tensor
     """(P, H) with P = N (N - 1) / 2, ordered by i, then j."""
     i: torch.Tensor

@@ -51,11 +51,11 @@ def settle(refined: Refined, joint: FloatArray, *, guessed: bool = False) -> tup
     rotations, moved = refined.rotations, list(refined.moved)
     centres = cameras.camera_centre(rotations, refined.translations)
     rows = rows_of(moved)
-    turns = np.zeros((len(moved), 6, len(moved), 6))
+    changes = np.zeros((len(moved), 6, len(moved), 6))
     for slot, camera in enumerate(moved):
-        turns[slot, :, slot] = _by_adjustment(rotations[camera], refined.translations[camera])
-    turn = turns.reshape(len(rows), len(rows))
-    told = turn.T @ refined.information @ turn / WIDENING
+        changes[slot, :, slot] = _by_adjustment(rotations[camera], refined.translations[camera])
+    jacobian = changes.reshape(len(rows), len(rows))
+    told = jacobian.T @ refined.information @ jacobian / WIDENING
     share = np.ones(len(rows))
     groups = [np.searchsorted(moved, group).tolist() for group in refined.groups]
     for group in groups:

@@ -29,7 +29,7 @@ WITHIN = math.radians(15)
 BASIN = math.radians(30)
 """A mode owns the probability nearer to it than to any other mode, up to this angle: beyond it lies what no
 mode explains, so that a flat distribution has modes of hardly any weight."""
-LEAST_WEIGHT = 0.02
+LEAST_MODE_WEIGHT = 0.02
 """Modes below it are not reported: they are ripples."""
 RUNNER_UP_WEIGHT = 0.15
 """A second mode matters from here on: about one chance in seven of being the true one."""
@@ -76,7 +76,7 @@ def describe_pairs(
         spoken = Evidence.GEOMETRIC in _evidence(energies, pair)
         spread = 1.0 if spoken else calibration.pair_spread
         strongest = int(by_weight[0])
-        told = by_weight[(weights[by_weight] >= LEAST_WEIGHT) | (by_weight == strongest)]
+        told = by_weight[(weights[by_weight] >= LEAST_MODE_WEIGHT) | (by_weight == strongest)]
         cores = _cores(distributions, pair, centres[told], basins[told]) * spread
         modes = tuple(
             Mode(camera_j_from_camera_i=centres[mode].numpy(), weight=float(weights[mode]), covariance=core)
@@ -317,10 +317,10 @@ def covariances_of_unknown_trust(
 
 
 def _in_object_frame(
-    turns: FloatArray, rotations: FloatArray, translations: FloatArray, calibration: Calibration
+    spread: FloatArray, rotations: FloatArray, translations: FloatArray, calibration: Calibration
 ) -> FloatArray:
-    """Covariances (N, 6, 6) of poses from those of the cameras' turns, (N, 3, 3) in the cameras' own axes."""
-    spread = turns + SOLVER_FLOOR**2 * np.eye(3)
+    """Covariances (N, 6, 6) of poses from those of their rotations, (N, 3, 3) in the cameras' own axes."""
+    spread = spread + SOLVER_FLOOR**2 * np.eye(3)
     sigma = np.diag(np.square(calibration.translation_sigma))
     shifts = np.repeat(sigma[None], len(rotations), 0)
     # By definition of the unit of length the first camera's distance is one.
@@ -331,8 +331,8 @@ def _in_object_frame(
     for camera, object_from_camera in enumerate(rotations.transpose(0, 2, 1)):
         # A turn e of the camera (axes of the camera, left perturbation of camera_from_object) is the turn
         # -R^T e in the object's axes, and moves the centre -R^T t by -R^T (t x e).
-        turn = np.concatenate([-object_from_camera @ so3.hat(translations[camera]), -object_from_camera])
-        covariances[camera] = turn @ spread[camera] @ turn.T
+        jacobian = np.concatenate([-object_from_camera @ so3.hat(translations[camera]), -object_from_camera])
+        covariances[camera] = jacobian @ spread[camera] @ jacobian.T
         # To second order a turn e also moves it by e x (e x t) / 2: along the ray, where turns are large.
         bend = (np.trace(spread[camera]) * np.eye(3) - spread[camera]) @ translations[camera] / 2
         bend *= min(

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relpose_ros.geometry import so3
-from relpose_ros.inference.pair_distribution import SearchSettings, ascend, peaks, search
+from relpose_ros.inference.pair_distribution import SearchSettings, ascend, highest_apart, search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 
 
@@ -71,7 +71,7 @@ def test_both_modes_of_a_symmetric_pair_are_found(fisher_scene_type, seed, angle
 def test_peaks_keep_their_distance(fisher_scene):
     rotations = torch.from_numpy(so3.random_rotations(200, np.random.default_rng(0)))[None]
     values = torch.rand(1, 200, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    tops, heights = peaks(rotations, values, 5, math.radians(40))
+    tops, heights = highest_apart(rotations, values, 5, math.radians(40))
     assert float(heights[0, 0]) == float(values.max())
     assert (heights[0].diff() <= 0).all()
     chosen = rotations[0, tops[0]].numpy()
@@ -85,14 +85,14 @@ def test_peaks_of_several_rotations_differ_in_one_of_them():
     solutions = torch.eye(3, dtype=torch.float64).repeat(1, 4, 3, 1, 1)
     solutions[0, :, 2] = last
     values = torch.tensor([[2.0, 3.0, 1.0, 0.5]], dtype=torch.float64)
-    tops, heights = peaks(solutions, values, 4, math.radians(10))
+    tops, heights = highest_apart(solutions, values, 4, math.radians(10))
     assert tops[0, :2].tolist() == [1, 2]
     assert heights[0].tolist() == [3.0, 1.0, -math.inf, -math.inf]
 
 
 def test_peaks_say_when_there_are_no_more():
     rotations = torch.eye(3, dtype=torch.float64).expand(1, 4, 3, 3)
-    _, heights = peaks(rotations, torch.arange(4.0, dtype=torch.float64)[None], 3, math.radians(10))
+    _, heights = highest_apart(rotations, torch.arange(4.0, dtype=torch.float64)[None], 3, math.radians(10))
     assert heights[0].tolist() == [3.0, -math.inf, -math.inf]
 
 
