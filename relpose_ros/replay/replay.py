@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from relpose_ros.estimates import CameraPose, FloatArray, Mode, ObjectPose, PairRotation
+    from relpose_ros.replay.bags import Input
     from relpose_ros.replay.comparison import TruePose
     from relpose_ros.replay.recording import EstimateRecord, ViewRecord
     from relpose_ros.scanning.scanner import SupportsEstimate
@@ -96,43 +97,10 @@ def replay(
         _check_writable(output)  # before the long part
         if estimator is None:
             estimator = settings.load_estimator(weights)
-        scanner = Scanner(estimator, settings)
-        recordings: dict[str, Recording] = {}
-        forgotten: set[str] = set()
-        rejections: Counter[str] = Counter()
-        examples: dict[str, str] = {}
-        total = sum(reader.counts[topic] for topic in inputs)
-        with logging_redirect_tqdm(), tqdm(total=total, desc=bag.name, unit=" msg", disable=None) as progress:
-            for record in reader.records(inputs):
-                entry = inputs[record.topic]
-                receipt = scanner.receive(entry.kind, record.topic, record.message, entry.camera)
-                if receipt.rejected:
-                    # The numbers differ from message to message, the reason does not.
-                    reason = re.sub(r"-?\d[\d.e+-]*", "#", receipt.reason)
-                    rejections[reason] += 1
-                    examples.setdefault(reason, receipt.reason)
-                while scanner.pending():
-                    for result in scanner.estimate_pending():
-                        object_id = result.scan.object_id
-                        if not result.estimate.cameras:  # takes back what a file keeps
-                            forgotten.add(object_id)
-                            continue
-                        recording = recordings.setdefault(object_id, Recording(object_id, keep=settings.keep))
-                        recording.add(result, record.log_time_ns)
-                        progress.set_postfix_str(result.estimate.status[:60], refresh=False)
-                progress.update()
-    statistics = scanner.statistics()
-    # The counts of a scan that made room for another object's are gone with it.
-    for object_id in recordings.keys() - forgotten:
-        recordings[object_id].declined = statistics.scans[object_id].declined
-    for topic, entry in inputs.items():
-        counts = statistics.topics.get(topic)
-        if entry.kind == "camera_pose" and counts is not None and not counts.used:
-            text = (
-                "None of the %d camera poses on %s has the stamp of a view: they tell nothing of the scale."
-            )
-            logger.warning(text, counts.received, topic)
-    rejected = [(examples[reason], count) for reason, count in rejections.most_common()]
+        scanner, rejections = Scanner(estimator, settings), _Rejections()
+        recordings = _fed(reader, inputs, scanner, rejections, settings)
+    _warn_of_lone_poses(inputs, scanner)
+    rejected = rejections.most_common()
     for topic, count in sorted(reader.unreadable.items()):
         rejected.append((f"{topic}: the message is not what its type says.", count))
     for example, count in rejected[:SHOWN_REASONS]:
@@ -148,16 +116,83 @@ def replay(
             known = of_one_camera(truth, (each.view.stamp_ns for each in recording.views))
             _write(folder / name, recording, settings, known, rejected, bag.name, cells)
     for name, recording in _folders(recordings).items():
-        last = recording.estimates[-1].estimate
-        logger.info(
-            "%s: %d estimates of %r from %d views, %.2f s each; %s.",
-            *(output / name / REPORT_FILE, len(recording.estimates), recording.object_id),
-            *(len(recording.views), np.mean([each.estimate.seconds for each in recording.estimates])),
-            last.status,
-        )
-        told = [recording.arrivals() if recording.declined else "", recording.lost_enough()]
-        if any(told):
-            logger.info("Of %r: %s.", recording.object_id, "; ".join(filter(None, told)))
+        _tell(output / name / REPORT_FILE, recording)
+
+
+class _Rejections:
+    """What was rejected, by reason: the numbers in it differ from message to message, the reason does not."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._examples: dict[str, str] = {}
+
+    def add(self, reason: str) -> None:
+        general = re.sub(r"-?\d[\d.e+-]*", "#", reason)
+        self._counts[general] += 1
+        self._examples.setdefault(general, reason)
+
+    def most_common(self) -> list[tuple[str, int]]:
+        """An example of each, and how many there are of its kind."""
+        return [(self._examples[general], count) for general, count in self._counts.most_common()]
+
+
+def _fed(
+    reader: BagReader,
+    inputs: Mapping[str, Input],
+    scanner: Scanner,
+    rejections: _Rejections,
+    settings: ScanSettings,
+) -> dict[str, Recording]:
+    """A bag's messages through a scanner, with a progress bar: what came of it, by object."""
+    recordings: dict[str, Recording] = {}
+    forgotten: set[str] = set()
+    total = sum(reader.counts[topic] for topic in inputs)
+    name = reader.path.name
+    with logging_redirect_tqdm(), tqdm(total=total, desc=name, unit=" msg", disable=None) as progress:
+        for record in reader.records(inputs):
+            entry = inputs[record.topic]
+            receipt = scanner.receive(entry.kind, record.topic, record.message, entry.camera)
+            if receipt.rejected:
+                rejections.add(receipt.reason)
+            while scanner.pending():
+                for result in scanner.estimate_pending():
+                    object_id = result.scan.object_id
+                    if not result.estimate.cameras:  # takes back what a file keeps
+                        forgotten.add(object_id)
+                        continue
+                    recording = recordings.setdefault(object_id, Recording(object_id, keep=settings.keep))
+                    recording.add(result, record.log_time_ns)
+                    progress.set_postfix_str(result.estimate.status[:60], refresh=False)
+            progress.update()
+    scans = scanner.statistics().scans
+    # The counts of a scan that made room for another object's are gone with it.
+    for object_id in recordings.keys() - forgotten:
+        recordings[object_id].declined = scans[object_id].declined
+    return recordings
+
+
+def _warn_of_lone_poses(inputs: Mapping[str, Input], scanner: Scanner) -> None:
+    topics = scanner.statistics().topics
+    for topic, entry in inputs.items():
+        if entry.kind == "camera_pose" and topic in topics and not topics[topic].used:
+            text = (
+                "None of the %d camera poses on %s has the stamp of a view: they tell nothing of the scale."
+            )
+            logger.warning(text, topics[topic].received, topic)
+
+
+def _tell(report: Path, recording: Recording) -> None:
+    """In the log, what came of one object's views."""
+    last = recording.estimates[-1].estimate
+    logger.info(
+        "%s: %d estimates of %r from %d views, %.2f s each; %s.",
+        *(report, len(recording.estimates), recording.object_id),
+        *(len(recording.views), np.mean([each.estimate.seconds for each in recording.estimates])),
+        last.status,
+    )
+    told = [recording.arrivals() if recording.declined else "", recording.lost_enough()]
+    if any(told):
+        logger.info("Of %r: %s.", recording.object_id, "; ".join(filter(None, told)))
 
 
 def _cells(
