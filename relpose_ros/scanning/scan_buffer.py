@@ -274,7 +274,11 @@ class ScanBuffer:
     def _note_arrival(self, stamp_ns: int, frame_id: str, topic: str) -> None:
         """Time goes on in this topic: whatever lay far behind was garbage."""
         self._seen.append((stamp_ns, frame_id, topic))
-        self._newest_on[topic] = self._newest_of[topic, frame_id] = stamp_ns
+        self._newest_on[topic] = stamp_ns
+        self._newest_of.pop((topic, frame_id), None)
+        self._newest_of[topic, frame_id] = stamp_ns
+        if len(self._newest_of) > _SEEN:  # a name of its own for each picture
+            del self._newest_of[next(iter(self._newest_of))]
         self._suspects.pop(topic, None)
         # What is held, or a newcomer on trial, would wait for ever for an estimate that failed.
         self._changed |= self._failed
@@ -292,15 +296,13 @@ class ScanBuffer:
         return self._settings.keep == "spread" and stamp_ns < self._paused_until_ns
 
     def _jumps_back(self, stamp_ns: int, frame_id: str, topic: str) -> bool:
-        own_ns = self._newest_of.get((topic, frame_id))
-        if own_ns is not None and own_ns < stamp_ns:
-            return False
-        # Each topic's own clock: another one may lag behind by more than any jump, but not by any time.
-        newest_ns = self._newest_on.get(topic)
-        if newest_ns is not None and stamp_ns <= newest_ns - self._backward_jump_ns:
-            return True
         ahead = {view.stamp_ns for view in self._all() if view.stamp_ns > stamp_ns + LONGEST_LAG_NS}
-        return len(ahead) == 1
+        if len(ahead) == 1:
+            return True
+        # Each topic's own clock, and each camera's: another one may lag behind by more than any jump.
+        newest_ns, own_ns = self._newest_on.get(topic), self._newest_of.get((topic, frame_id))
+        lags = own_ns is not None and own_ns < stamp_ns
+        return newest_ns is not None and not lags and stamp_ns <= newest_ns - self._backward_jump_ns
 
     def _suspect(self, view: View, topic: str) -> None:
         """Remember a view that may be the first after a jump, with those of its stamp."""

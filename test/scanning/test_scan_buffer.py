@@ -225,6 +225,14 @@ def test_a_garbage_stamp_on_one_topic_does_not_block_the_others(caplog: pytest.L
     assert "stamp 1000000.000000000 is dropped" in caplog.text
 
 
+def test_a_garbage_stamp_of_one_camera_does_not_block_the_other_on_its_topic() -> None:
+    buffer = ScanBuffer("mug", ScanSettings())
+    for stamp, frame in ((1, "left"), (1.1, "right"), (1e6, "left")):
+        assert buffer.add(view(stamp, frame), "a").accepted
+    assert [buffer.add(view(stamp, "right"), "a").accepted for stamp in (2, 3, 4)] == [False, True, True]
+    assert stamps_of(buffer) == [1, 1.1, 2, 3, 4]
+
+
 def test_a_topic_whose_clock_is_another_takes_nothing_away() -> None:
     buffer = buffer_with(1000, 1001)
     assert all(each.rejected for each in add(buffer, 3, 4, 5, topic="b"))
