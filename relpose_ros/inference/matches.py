@@ -175,7 +175,8 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> tuple[tuple[Relative
 def trust(inliers: int) -> float:
     """Probability that one of a pair's poses is right, learned from pairs whose pose is known.
 
-    Logistic in the logarithm of the inliers (`benchmarks/match_trust.py` fits it).
+    Logistic in the logarithm of the inliers, fitted by `benchmarks/match_trust.py` on the photographs that
+    the shipped network was trained on: ascott_hound, buddha and socketed_axe.
     """
     return LARGEST_TRUST / (1 + math.exp(-(TRUST[0] + TRUST[1] * math.log(inliers))))
 
