@@ -36,8 +36,8 @@ SCANS = 24
 LEAST_FLAT = 0.2
 """How often a network may be plainly wrong of a pair at least, whatever the fit says: a robot's objects are
 not those of the fit, and pairs that are surely wrong together outvote all else. With 0.05 the 90 % ellipsoids
-of scans where network and matches are joined held 79 to 85 % of the rotations, with 0.2 86 to 94 %, at the
-same accuracy."""
+of scans where network and matches are joined held 79 to 85 % of the rotations, with 0.2 of the same weights
+86 to 94 %, at the same accuracy."""
 
 Reports = dict[str, tuple["CalibrationReport", "CalibrationReport"]]
 """By group: uncalibrated and calibrated."""
