@@ -42,15 +42,15 @@ def weights(network):
 
 def test_a_resumed_run_ends_with_the_same_weights_and_curve(tmp_path, scans):
     whole = Trainer(SETTINGS, tmp_path / "whole", scans, scans)
-    whole.run(log_every=2, check_every=6, progress=False)
+    whole.run(log_every=2, check_every=12, progress=False)
     assert whole.finished
     first = Trainer(SETTINGS, tmp_path / "halves", scans, scans)
     first._out_of_time = lambda *_: first.step >= 9
-    first.run(log_every=2, check_every=6, progress=False)
+    first.run(log_every=2, check_every=12, progress=False)
     first.train_step()  # what comes after the checkpoint is lost
     second = Trainer(SETTINGS, tmp_path / "halves", scans, scans)
     assert second.step == 9
-    second.run(log_every=2, check_every=6, progress=False)
+    second.run(log_every=2, check_every=12, progress=False)
     assert weights(second.network).equal(weights(whole.network))
     assert weights(second.average).equal(weights(whole.average))
 
