@@ -154,28 +154,6 @@ def test_the_energy_is_the_sum_of_its_parts_through_the_perceptron(energy_networ
         assert not torch.allclose(network.energies(features[2], features[1], turned), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("preset", ["paper", "compact"])
-def test_the_folded_head_says_what_the_network_says(preset: str) -> None:
-    network = random_network(preset, 4)
-    width = network.preset.energy_width
-    contexts = torch.randn(3, width, generator=torch.Generator().manual_seed(4))
-    turned = rotations(15).reshape(3, 5, 3, 3)
-    head = network.energy_head()
-    entries = turned.clone().requires_grad_()
-    embeddings = network.embed_relative(entries)
-    expected = network.pair_energies(contexts, embeddings)
-    (slopes,) = torch.autograd.grad(expected.sum(), entries)
-    expected, embeddings = expected.detach(), embeddings.detach()
-    torch.testing.assert_close(head.embed(turned), embeddings)
-    torch.testing.assert_close(head.energies(contexts, embeddings), expected)
-    torch.testing.assert_close(
-        head.energies(contexts, embeddings[0]), network.pair_energies(contexts, embeddings[0]).detach()
-    )
-    energies, gradients = head.energies_and_gradients(contexts, turned)
-    torch.testing.assert_close(energies, expected)
-    torch.testing.assert_close(gradients, slopes)
-
-
 @torch.no_grad()
 def test_a_view_looked_at_alone_is_the_view_looked_at_among_others(compact: RelPose) -> None:
     """What lets an estimate keep a view's features while its scan grows."""
