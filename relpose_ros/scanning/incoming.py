@@ -174,10 +174,8 @@ def view_from_image(image: Any, info: Any, source: Source, rectification: str = 
         named = RECTIFIED_TOPIC.search(source.topic) is not None
         rectified = rectification == "rectified" or (rectification == "auto" and named)
         if rectified and any(info.p):
-            intrinsics, distortion = (
-                _intrinsics(np.reshape(info.p, (3, 4))[:, :3].ravel(), full, source),
-                None,
-            )
+            matrix = np.reshape(info.p, (3, 4))[:, :3].ravel()
+            intrinsics, distortion = _intrinsics(matrix, full, source), None
         else:
             intrinsics = _intrinsics(info.k, full, source)
             distortion = None if rectified or intrinsics is None else _distortion(info, source)

@@ -156,11 +156,12 @@ class ScanBuffer:
                     self._take(each, origin)
         elif self._jumps_back(view.stamp_ns, view.frame_id, topic):
             self._suspect(view, topic)
-            newest_ns = self._newest_on.get(topic)
-            than = "the newest view" if newest_ns is None else "the last one on this topic"
-            behind = ((self._newest_ns() or 0) if newest_ns is None else newest_ns) - view.stamp_ns
-            text = f"it is {behind / 1e9:.3f} s older than {than}: rejected unless the next one"
-            return Decision(False, f"{text} confirms that time jumped backwards", rejected=True)
+            than, newest_ns = "the last one on this topic", self._newest_on.get(topic, 0)
+            if newest_ns <= view.stamp_ns:
+                than, newest_ns = "the newest view", max(each.stamp_ns for each in self._all())
+            behind = (newest_ns - view.stamp_ns) / 1e9
+            text = f"it is {behind:.3f} s older than {than}: rejected unless the next one confirms"
+            return Decision(False, f"{text} that time jumped backwards", rejected=True)
         return self._take(view, topic)
 
     def work(self) -> Work | None:

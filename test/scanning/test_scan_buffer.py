@@ -219,6 +219,7 @@ def test_a_garbage_stamp_on_one_topic_does_not_block_the_others(caplog: pytest.L
     first, second, third = add(buffer, 3, 4, 5, topic="b")
     assert first.rejected
     assert first.reason.startswith("it is 999997.000 s older than the newest view")
+    assert "time jumped backwards" in first.reason
     assert second.accepted
     assert third.accepted
     assert stamps_of(buffer) == [1, 2, 3, 4, 5]
@@ -229,8 +230,22 @@ def test_a_garbage_stamp_of_one_camera_does_not_block_the_other_on_its_topic() -
     buffer = ScanBuffer("mug", ScanSettings())
     for stamp, frame in ((1, "left"), (1.1, "right"), (1e6, "left")):
         assert buffer.add(view(stamp, frame), "a").accepted
-    assert [buffer.add(view(stamp, "right"), "a").accepted for stamp in (2, 3, 4)] == [False, True, True]
+    first, second, third = (buffer.add(view(stamp, "right"), "a") for stamp in (2, 3, 4))
+    assert first.reason.startswith(
+        "it is 999998.000 s older than the last one on this topic: rejected unless"
+    )
+    assert (first.accepted, second.accepted, third.accepted) == (False, True, True)
     assert stamps_of(buffer) == [1, 1.1, 2, 3, 4]
+
+
+def test_a_garbage_stamp_on_another_topic_does_not_block_one_that_goes_on() -> None:
+    buffer = ScanBuffer("mug", ScanSettings())
+    for stamp, topic in ((1, "b"), (1e6, "a")):
+        assert buffer.add(view(stamp), topic).accepted
+    first, second = add(buffer, 2, 3, topic="b")
+    assert first.reason.startswith("it is 999998.000 s older than the newest view: rejected unless the next")
+    assert second.accepted
+    assert stamps_of(buffer) == [1, 2, 3]
 
 
 def test_a_topic_whose_clock_is_another_takes_nothing_away() -> None:
