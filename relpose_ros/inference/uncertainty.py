@@ -66,12 +66,13 @@ def describe_pairs(
     solved = solution[energies.j] @ solution[energies.i].mT
     masses = distributions.masses(calibration.temperature, calibration.flat)
     entropies = -(masses * (masses.clamp_min(1e-300).log() - distributions.log_volumes)).sum(1)
+    found = [_basins(distributions, pair, mass) for pair, mass in enumerate(masses)]
+    orders = [torch.argsort(basins.sum(1), descending=True, stable=True) for _, _, basins in found]
+    heaviest = torch.stack([centres[order[0]] for (centres, _, _), order in zip(found, orders, strict=True)])
+    covariances = _second_moments(distributions, heaviest, masses)
     pairs = []
-    for pair in range(energies.count):
-        mass = masses[pair]
-        centres, angles, basins = _basins(distributions, pair, mass)
-        weights = basins.sum(1)
-        by_weight = torch.argsort(weights, descending=True, stable=True)
+    for pair, ((centres, angles, basins), by_weight) in enumerate(zip(found, orders, strict=True)):
+        mass, weights = masses[pair], basins.sum(1)
         # Fitted where the network speaks alone; the width of a matched peak is fitted by itself.
         spoken = Evidence.GEOMETRIC in _evidence(energies, pair)
         spread = 1.0 if spoken else calibration.pair_spread
@@ -89,7 +90,7 @@ def describe_pairs(
                 i=int(energies.i[pair]),
                 j=int(energies.j[pair]),
                 camera_j_from_camera_i=modes[0].camera_j_from_camera_i,
-                covariance=_second_moment(distributions, pair, centres[strongest], mass) * spread,
+                covariance=covariances[pair] * spread,
                 entropy=float(entropies[pair]),
                 probability_within_15_deg=_share(angles[:, strongest], mass, distributions.spacings),
                 modes=modes,
@@ -181,18 +182,30 @@ def _share(angles: torch.Tensor, mass: torch.Tensor, spacings: torch.Tensor) -> 
     return float((_inside(angles, WITHIN, spacings) * mass).sum())
 
 
-def _second_moment(
-    distributions: PairDistributions, pair: int, centre: torch.Tensor, mass: torch.Tensor
+def _second_moments(
+    distributions: PairDistributions, centres: torch.Tensor, masses: torch.Tensor
 ) -> FloatArray:
-    """Of the rotation vector from ``centre``, left perturbation, over the given masses. -> (3, 3) rad^2."""
-    share, vectors = _turns_from(distributions, pair, centre, mass)
-    return _moment(share, vectors) + _least_moment(distributions)
+    """Of each pair's rotation vector from its centre, left perturbation, over its masses.
+
+    (P, 3, 3), (P, L) -> (P, 3, 3) rad^2.
+    """
+    used = masses > 1e-9 * masses.amax(1, keepdim=True)  # logarithms of the rest would be work for nothing
+    pairs, cells = used.nonzero(as_tuple=True)
+    vectors = _turns((distributions.rotations[pairs, cells] @ centres[pairs].mT).numpy())
+    weights = masses[used].numpy()
+    squares = (vectors[:, :, None] * (weights[:, None] * vectors)[:, None, :]).reshape(-1, 9)
+    starts = np.searchsorted(pairs.numpy(), np.arange(len(masses)))
+    totals = np.add.reduceat(weights, starts)
+    sums = np.add.reduceat(squares, starts)
+    return np.asarray((sums / totals[:, None]).reshape(-1, 3, 3) + _least_moment(distributions))
 
 
 def _cores(
     distributions: PairDistributions, pair: int, centres: torch.Tensor, basins: torch.Tensor
 ) -> FloatArray:
-    """As `_second_moment`, of modes' cores: the further out, the less the mass counts. -> (M, 3, 3) rad^2.
+    """As `_second_moments`, of the cores of one pair's modes. -> (M, 3, 3) rad^2.
+
+    The further out, the less the mass counts.
 
     The scatter of the Student's t that suits the masses best (Kent and Tyler 1991), in the measure in which a
     Gaussian has its own covariance. A few near misses, degrees off, would be most of a second moment, and
@@ -218,20 +231,6 @@ def _cores(
         # At the end the weights sum to one; made so in every round, they get there sooner (Kent et al. 1994).
         scatter = weights / weights.sum(1, keepdims=True) @ squares + least
     return scatter.reshape(-1, 3, 3) / OF_GAUSSIAN
-
-
-def _moment(weights: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Weighted sum (3, 3) of the outer products of vectors (L, 3) with themselves."""
-    return np.asarray((weights[:, None] * vectors).T @ vectors)
-
-
-def _turns_from(
-    distributions: PairDistributions, pair: int, centre: torch.Tensor, mass: torch.Tensor
-) -> tuple[FloatArray, FloatArray]:
-    """Shares (L,) of the masses that matter, and the rotation vectors (L, 3) from ``centre`` to them."""
-    used = mass > 1e-9 * mass.max()  # logarithms of the rest would be most of the work for nothing
-    share = (mass[used] / mass[used].sum()).numpy()
-    return share, _turns((distributions.rotations[pair][used] @ centre.T).numpy())
 
 
 def _least_moment(distributions: PairDistributions) -> FloatArray:
@@ -363,11 +362,10 @@ def _joint_spread(
     masses = distributions.masses(calibration.temperature, calibration.flat)
     information = UNTIED * np.eye(3 * energies.views)
     given_back = np.zeros((energies.views, 3, 3))
+    about = [_about(distributions, energies, pair, relative, masses) for pair in range(energies.count)]
+    moments = _second_moments(distributions, relative, torch.stack(about))
     for pair, (i, j) in enumerate(zip(energies.i.tolist(), energies.j.tolist(), strict=True)):
-        moment = _second_moment(
-            distributions, pair, relative[pair], _about(distributions, energies, pair, relative, masses)
-        )
-        variances, axes = np.linalg.eigh(moment)
+        variances, axes = np.linalg.eigh(moments[pair])
         nothing = axes / np.maximum(variances, UNIFORM_VARIANCE) @ axes.T
         told = axes / variances @ axes.T - nothing
         turned = relative[pair].numpy()
