@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import rclpy
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import InvalidHandle, ParameterException
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args, try_shutdown
@@ -92,6 +92,10 @@ def _spin(executor: MultiThreadedExecutor, node: ScanNode, stopping: threading.E
     while not stopping.is_set():
         try:
             executor.spin_once()
+        except InvalidHandle:
+            # Another thread has destroyed a subscription, to make it anew or in a transition, between the
+            # executor's listing what to wait for and its waiting: the next turn lists what there is.
+            node.get_logger().debug(f"What was to be waited for is gone:\n{traceback.format_exc()}")
         except Exception:
             if not stopping.is_set():
                 node.get_logger().error(f"A callback failed:\n{traceback.format_exc()}")

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import threading
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 from geometry_msgs.msg import PoseArray
 from lifecycle_msgs.msg import Transition
+from rclpy.exceptions import InvalidHandle
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from relpose_ros.msg import ScanEstimate
 from visualization_msgs.msg import Marker, MarkerArray
+
+from relpose_ros.node import scan_node
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -366,3 +370,33 @@ def test_it_leaves_with_zero_whatever_it_does(running: Any, graph: Any, make: An
     graph.publish(OBJECT_VIEW, *(make.object_view(100.0 + k, "mug") for k in range(8)))
     assert running.end() == 0
     assert not running.told("Traceback"), running.log
+
+
+def test_what_is_destroyed_while_it_is_waited_for_is_no_failure() -> None:
+    """rclpy guards most entities against it, but not the events of a subscription."""
+    stopping, told = threading.Event(), []
+
+    turns = [InvalidHandle("destruction was requested"), ValueError("a defect")]
+
+    class Executor:
+        def spin_once(self) -> None:
+            if turns:
+                raise turns.pop(0)
+            stopping.set()
+
+    class Logger:
+        def debug(self, text: str) -> None:
+            told.append(("debug", text))
+
+        def error(self, text: str) -> None:
+            told.append(("error", text))
+
+    class Node:
+        def get_logger(self) -> Logger:
+            return Logger()
+
+    scan_node._spin(cast("Any", Executor()), cast("Any", Node()), stopping)
+    (gone, defect) = told
+    assert gone[0] == "debug"
+    assert defect[0] == "error"
+    assert "ValueError: a defect" in defect[1]
