@@ -368,7 +368,7 @@ class Trainer:
         self._scaler.load_state_dict(state["scaler"])
         self.step, self.images, self._seconds = state["step"], state["images"], state["seconds"]
         self._began = state.get("began")  # missing in files of before it could be anything but random
-        self._unlogged = list(state.get("unlogged", []))
+        self._unlogged = [each.to(self._device) for each in state.get("unlogged", [])]
         if self._rank == 0:
             _cut_curve(self.folder / CURVE, self.step)
 
