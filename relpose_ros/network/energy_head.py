@@ -27,11 +27,9 @@ class EnergyHead:
 
     def __init__(self, network: RelPose) -> None:
         query = network.embed_query
-        activation, middle, _, before, last = network.layers
+        activation, middle = network.layers[0], network.layers[1]
         assert isinstance(activation, nn.LeakyReLU)
         assert isinstance(middle, nn.Linear)
-        assert isinstance(before, nn.Linear)
-        assert isinstance(last, nn.Linear)
         self._slope = activation.negative_slope
         with torch.no_grad():
             entries = torch.eye(9, dtype=query.weight.dtype, device=query.weight.device).view(9, 3, 3)
@@ -40,9 +38,7 @@ class EnergyHead:
             self._angles = (released[..., None] * network.embedding.flatten().to(released.dtype)).flatten(1)
             self._query, self._query_bias = query.weight.clone(), query.bias.clone()
             self._middle, self._middle_bias = middle.weight.clone(), middle.bias.clone()
-            # No activation lies between the last two layers, so one vector does the work of both.
-            self._last = last.weight @ before.weight  # (1, H)
-            self._last_bias = functional.linear(before.bias, last.weight, last.bias)
+            self._last, self._last_bias = network.last_layers()
 
     @torch.no_grad()
     def embed(self, rotations: torch.Tensor) -> torch.Tensor:

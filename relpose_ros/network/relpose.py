@@ -190,13 +190,14 @@ class RelPose(nn.Module):
             (..., P, K).
         """
         hidden = self.layers[:3](contexts[..., None, :] + embeddings)
+        return functional.linear(hidden, *self.last_layers())[..., 0]
+
+    def last_layers(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Weight (1, H) and bias (1,) that do the work of the last two: no activation lies between them."""
         before, last = self.layers[3], self.layers[4]
         assert isinstance(before, nn.Linear)
         assert isinstance(last, nn.Linear)
-        # No activation lies between the last two layers, so one vector does the work of both.
-        weight = last.weight @ before.weight  # (1, H)
-        bias = functional.linear(before.bias, last.weight, last.bias)
-        return functional.linear(hidden, weight, bias)[..., 0]
+        return last.weight @ before.weight, functional.linear(before.bias, last.weight, last.bias)
 
     def energy_head(self) -> EnergyHead:
         """`embed_relative` and `pair_energies` with the weights as they are now, for many rotations."""

@@ -107,9 +107,9 @@ class ScanBuffer:
         Saves decoding it.
         """
         newest_ns = self._newest_ns()
-        jumps = self._jumps_back(stamp_ns, frame_id, topic)
-        jumps |= self._confirms_jump(stamp_ns, frame_id, topic)
-        if jumps or newest_ns is None:
+        if newest_ns is None or self._jumps_back(stamp_ns, frame_id, topic):
+            return None
+        if self._confirms_jump(stamp_ns, frame_id, topic):
             return None
         if (stamp_ns, frame_id, topic) in self._seen:
             text = f"a view with this stamp and frame_id {frame_id!r} came on this topic before"
