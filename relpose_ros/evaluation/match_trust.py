@@ -33,8 +33,8 @@ RIDGE = 0.05
 class MatchedPairs:
     """Statistics of matched pairs and whether they were right."""
 
-    inliers: FloatArray
-    """(Q,) of each pair's best pose."""
+    signs: FloatArray
+    """(Q, F) `Support.signs` of each pair."""
     right: npt.NDArray[np.bool_]
     """(Q,)."""
     errors: FloatArray
@@ -48,23 +48,22 @@ def observe(capture: Capture, *, masked: bool) -> MatchedPairs:
     photos = [k for k, photo in enumerate(capture.photos) if photo.camera_from_world is not None]
     features = [find_features(capture.view(k, masked=masked)) for k in photos]
     rotations = [np.asarray(capture.photos[k].camera_from_world)[:, :3] for k in photos]
-    inliers, right, errors, covariances = [], [], [], []
+    signs, right, errors, covariances = [], [], [], []
     for i in range(len(photos)):
         for j in range(i + 1, len(photos)):
             explained = explain(features[i], features[j])
             if explained is None:
                 continue
-            poses, explained_by_best = explained
             truth = rotations[j] @ rotations[i].T
-            turns = [so3.log(truth @ pose.rotation.T) for pose in poses]
+            turns = [so3.log(truth @ pose.rotation.T) for pose in explained.poses]
             best = int(np.argmin([np.linalg.norm(turn) for turn in turns]))
-            inliers.append(len(explained_by_best))
+            signs.append(explained.support.signs)
             right.append(bool(np.linalg.norm(turns[best]) < RIGHT))
             if right[-1]:
                 errors.append(turns[best])
-                covariances.append(poses[best].covariance)
+                covariances.append(explained.poses[best].covariance)
     return MatchedPairs(
-        np.array(inliers, np.float64),
+        np.array(signs).reshape(len(signs), -1),
         np.array(right, bool),
         np.array(errors).reshape(-1, 3),
         np.array(covariances).reshape(-1, 3, 3),
@@ -72,10 +71,10 @@ def observe(capture: Capture, *, masked: bool) -> MatchedPairs:
 
 
 def fit_trust(pairs: MatchedPairs) -> FloatArray:
-    """Logistic regression by Newton's method. -> (2,) `relpose_ros.inference.matches.TRUST`."""
-    design = np.stack([np.ones(len(pairs.right)), np.log(pairs.inliers)], 1)
+    """Logistic regression by Newton's method. -> (1 + F,) `relpose_ros.inference.matches.TRUST`."""
+    design = np.concatenate([np.ones((len(pairs.right), 1)), pairs.signs], 1)
     coefficients = np.zeros(design.shape[1])
-    penalty = RIDGE * np.diag([0.0, 1.0])
+    penalty = RIDGE * np.diag(np.arange(design.shape[1]) > 0)
     for _ in range(30):
         chance = 1 / (1 + np.exp(-design @ coefficients))
         slope = design.T @ (pairs.right - chance) - penalty @ coefficients

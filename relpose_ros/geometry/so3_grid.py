@@ -8,10 +8,12 @@ index of a cell is its level-0 index followed by one octal digit a level: tilt b
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -77,39 +79,44 @@ def cell_rotations(level: int, cells: npt.ArrayLike) -> FloatArray:
     return _from_hopf(azimuth, height, turn - belt * azimuth)
 
 
-def cells_at(level: int, rotations: npt.ArrayLike) -> IntArray:
-    """The cells of a level in which rotations lie: `cell_rotations` undone. (..., 3, 3) -> (...) indices."""
-    r = np.asarray(rotations, np.float64)
-    azimuth, height = np.arctan2(r[..., 1, 2], r[..., 0, 2]), r[..., 2, 2]
-    ca, sa = np.cos(azimuth), np.sin(azimuth)
+def cells_at(level: int, rotations: torch.Tensor) -> torch.Tensor:
+    """The cells of a level in which rotations lie: `cell_rotations` undone. (..., 3, 3) -> (...) indices.
+
+    In torch: a solver asks for tens of thousands.
+    """
+    entries = rotations.flatten(-2).unbind(-1)
+    (xx, xy, xz), (yx, yy, yz), height = entries[:3], entries[3:6], entries[8]
+    azimuth = torch.atan2(yz, xz)
+    ca, sa = azimuth.cos(), azimuth.sin()
     # The second row of Rz(-azimuth) R is (sin, cos, .) of the turn also where the z axis goes to a pole.
-    turn = np.arctan2(ca * r[..., 1, 0] - sa * r[..., 0, 0], ca * r[..., 1, 1] - sa * r[..., 0, 1])
+    turn = torch.atan2(ca * yx - sa * xx, ca * yy - sa * xy)
     x, y = _projected(azimuth, height)
     # Lines along a diamond's edges are a unit apart; floor says which diamond, the rest where in it.
     east, north = (y + 1 + x) / 2, (y + 1 - x) / 2
-    column, row = np.floor(east).astype(np.int64), np.floor(north).astype(np.int64)
+    column, row = east.floor().long(), north.floor().long()
     belt = column + row
-    quarter = (column - row - np.abs(belt)) // 2 % 4
+    quarter = (column - row - belt.abs()) // 2 % 4
     side, tilts = 1 << level, BASE_TILTS << level
-    column = np.clip(((east - column) * side).astype(np.int64), 0, side - 1)
-    row = np.clip(((north - row) * side).astype(np.int64), 0, side - 1)
-    tilt = np.floor((turn + belt * azimuth) * (tilts / (2 * np.pi))).astype(np.int64) % tilts
+    column = ((east - column) * side).long().clamp(0, side - 1)
+    row = ((north - row) * side).long().clamp(0, side - 1)
+    tilt = ((turn + belt * azimuth) * (tilts / (2 * math.pi))).floor().long() % tilts
     cells = ((1 - belt) * 4 + quarter) * BASE_TILTS + (tilt >> level)
     for bit in reversed(range(level)):
         cells = cells * 8 + ((tilt >> bit & 1) << 2 | (row >> bit & 1) << 1 | column >> bit & 1)
-    return np.asarray(cells)
+    return cells
 
 
-def _projected(azimuth: FloatArray, height: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _projected(azimuth: torch.Tensor, height: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """The HEALPix map projection, in units of pi/4: x along the equator, y up, -2 to 2."""
-    x = azimuth * (4 / np.pi)
-    width = np.sqrt(3 * np.maximum(0, 1 - np.abs(height)))  # of a polar diamond at that height
+    x = azimuth * (4 / math.pi)
+    width = (3 * (1 - height.abs()).clamp_min(0)).sqrt()  # of a polar diamond at that height
+    shrunk = width.clamp_min(1e-6)
+    middle = 2 * (x / 2).floor() + 1
+    inside = (x - middle).clamp(1e-6 - 1, 1 - 1e-6) * shrunk  # on an edge no floor is safe
     polar = width <= 1 + 1e-9
-    middle = 2 * np.floor(x / 2) + 1
-    inside = np.clip(x - middle, 1e-6 - 1, 1 - 1e-6) * np.maximum(width, 1e-6)  # on an edge no floor is safe
     return (
-        np.where(polar, middle + inside, x),
-        np.where(polar, np.sign(height) * (2 - np.maximum(width, 1e-6)), 1.5 * height),
+        torch.where(polar, middle + inside, x),
+        torch.where(polar, height.sign() * (2 - shrunk), 1.5 * height),
     )
 
 

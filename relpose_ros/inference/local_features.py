@@ -49,6 +49,16 @@ SAME_PLACE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
+class Outline:
+    """The object's box as a camera sees it."""
+
+    middle: FloatArray
+    """(2,) ray."""
+    size: float
+    """Length of its diagonal, in units of rays."""
+
+
+@dataclass(frozen=True, eq=False)
 class LocalFeatures:
     """The local features of one view."""
 
@@ -68,6 +78,8 @@ class LocalFeatures:
     """Whether the intrinsics are a guess."""
     unbounded: bool = False
     """Whether neither box nor mask tells the object from what stands around it, although they should."""
+    outline: Outline | None = None
+    """None where the box is the whole picture, which says nothing of the object."""
 
 
 def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
@@ -106,10 +118,12 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
     pixel = 1 / (scale * float(focal.mean()))
     box = view.box
     full = box.x0 <= 0 and box.y0 <= 0 and box.x1 >= view.full_width and box.y1 >= view.full_height
+    corners = (np.array([[box.x0, box.y0], [box.x1, box.y1]]) - [intrinsics.cx, intrinsics.cy]) / focal
     return LocalFeatures(
         *(rays, orientations, descriptors, places, plain, pixel),
         guessed=view.intrinsics is None,
         unbounded=full and view.mask is None and not surroundings,
+        outline=None if full else Outline(corners.mean(0), float(np.linalg.norm(corners[1] - corners[0]))),
     )
 
 

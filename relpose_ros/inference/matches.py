@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from relpose_ros.inference.local_features import LocalFeatures
+    from relpose_ros.inference.local_features import LocalFeatures, Outline
     from relpose_ros.views import View
 
     FloatArray = npt.NDArray[np.float64]
@@ -54,8 +54,8 @@ proportion."""
 PLANAR_SHARE = 0.8
 """Of the matches, explained by one homography: from here on the points may lie on a plane, which two poses
 explain equally well, or the camera may only have turned."""
-TRUST = (-6.24, 2.2)
-"""Coefficients of `trust`: the bias, and that of the inliers' logarithm."""
+TRUST = (-8.01, 2.33, -3.09, 2.51)
+"""Coefficients of `trust`: the bias, and those of `Support.signs`."""
 LARGEST_TRUST = 0.995
 """No captures are enough to learn how rare the rarest mistakes are."""
 WIDENING = 8.0
@@ -79,6 +79,12 @@ LEAST_POSE_WEIGHT = 0.03
 """Of an explanation that is worth telling, relative to the best."""
 MOST_EXPLANATIONS = 4
 """More say hardly anything, and each costs the solver time."""
+DISTANCE_DEVIATION = 0.2
+"""Relative standard deviation of the ratio of two cameras' distances from the object, by its boxes' sizes."""
+WIDEST_DIRECTION = math.radians(60)
+"""Standard deviation of a direction of which nothing is known, rad."""
+LOOK_AT_FREEDOM = 3.0
+"""Degrees of freedom of Student's t: boxes may be cut off, or the middle of another part of the object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +101,34 @@ class RelativePose:
     """(3, 3) of ``direction``, tangential to it."""
     weight: float
     """Relative to the pair's other explanations; they sum to one, less what is not worth telling."""
+
+
+@dataclass(frozen=True)
+class Support:
+    """What tells poses that are right from those that accidental matches happen to obey."""
+
+    inliers: int
+    """Matches that the best pose explains."""
+    residual: float
+    """Their mean distance from epipolar lines, pixels: accidental ones lie anywhere up to `THRESHOLD`."""
+    spread: float
+    """Of the inliers across their longest extent, relative to all features, in the view where it is less."""
+
+    @property
+    def signs(self) -> FloatArray:
+        """(3,) logarithms, as the logistic regression takes them."""
+        return np.log([self.inliers, self.residual + 0.05, self.spread + 0.02])
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """The poses that explain the matches of two views."""
+
+    poses: tuple[RelativePose, ...]
+    """Best first."""
+    inliers: IntArray
+    """(M, 2) positions of matched features of view i and of view j that the first pose explains."""
+    support: Support
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,15 +159,12 @@ NOTHING = TwoViewGeometry((), np.zeros((0, 2), np.int64), 0.0)
 
 def relate(first: LocalFeatures, second: LocalFeatures) -> TwoViewGeometry:
     """The relative pose of two views by their matches, and how far it is to be trusted."""
-    explained = explain(first, second)
-    if explained is None:
-        return NOTHING
-    poses, inliers = explained
-    return TwoViewGeometry(poses, inliers, trust(len(inliers)))
+    found = explain(first, second)
+    return NOTHING if found is None else TwoViewGeometry(found.poses, found.inliers, trust(found.support))
 
 
-def explain(first: LocalFeatures, second: LocalFeatures) -> tuple[tuple[RelativePose, ...], IntArray] | None:
-    """The poses that explain the matches of two views, best first, and the best's inliers (M, 2).
+def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
+    """The poses that explain the matches of two views.
 
     None where there are too few matches, or too few that any pose explains.
     """
@@ -160,7 +191,8 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> tuple[tuple[Relative
     near_i, near_j = rays_i[near], rays_j[near]
     starts = found + epipolar.turned_along(found, near_i, near_j, pixel) + _of_plane(near_i, near_j, pixel)
     poses = epipolar.facing(epipolar.refine(starts, near_i, near_j, pixel), near_i, near_j)
-    poses, weights = _distinct(poses, epipolar.costs(poses, rays_i, rays_j, pixel))
+    log_likelihoods = -epipolar.costs(poses, rays_i, rays_j, pixel) / TEMPER
+    poses, weights = _distinct(poses, log_likelihoods + _look_at(poses, first.outline, second.outline))
     distances = np.abs(epipolar.distances(poses[:1], rays_i, rays_j)[0])
     inside = (distances < THRESHOLD * pixel) & epipolar.in_front(poses[:1], rays_i, rays_j)[0]
     if inside.sum() < LEAST_MATCHES:
@@ -169,16 +201,25 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> tuple[tuple[Relative
     stated = _with_covariances(poses, weights, near_i, near_j, pixel)
     if first.guessed or second.guessed:
         stated = tuple(_widened(pose) for pose in stated)
-    return stated, np.stack([first.places[inliers[:, 0]], second.places[inliers[:, 1]]], 1)
+    spread = min(
+        _extent(features.rays[inliers[:, view]]) / max(_extent(features.rays), 1e-12)
+        for view, features in enumerate((first, second))
+    )
+    return Explanation(
+        stated,
+        np.stack([first.places[inliers[:, 0]], second.places[inliers[:, 1]]], 1),
+        Support(len(inliers), float(distances[inside].mean()) / pixel, spread),
+    )
 
 
-def trust(inliers: int) -> float:
+def trust(support: Support) -> float:
     """Probability that one of a pair's poses is right, learned from pairs whose pose is known.
 
-    Logistic in the logarithm of the inliers, fitted by `benchmarks/match_trust.py` on the photographs that
-    the shipped network was trained on: ascott_hound, buddha and socketed_axe.
+    Logistic, fitted by `benchmarks/match_trust.py` on the photographs that the shipped network was trained on
+    (ascott_hound, buddha, socketed_axe) and on eight rendered captures, boxes alone.
     """
-    return LARGEST_TRUST / (1 + math.exp(-(TRUST[0] + TRUST[1] * math.log(inliers))))
+    bias, *slopes = TRUST
+    return LARGEST_TRUST / (1 + math.exp(-(bias + float(support.signs @ slopes))))
 
 
 def _alike(turns: FloatArray) -> npt.NDArray[np.bool_]:
@@ -239,16 +280,43 @@ def _of_plane(rays_i: FloatArray, rays_j: FloatArray, pixel: float) -> Poses:
     return poses[sound][np.linalg.det(poses.rotations[sound]) > 0]
 
 
-def _distinct(poses: Poses, costs: FloatArray) -> tuple[Poses, FloatArray]:
-    """Poses that differ, best first, weighted (S,) by how well each explains the matches."""
-    likelihoods = np.exp(-(costs - costs.min()) / TEMPER)
+def _look_at(poses: Poses, first: Outline | None, second: Outline | None) -> FloatArray:
+    """Log densities of the poses' directions, if both cameras see the object where its box is. -> (S,).
+
+    The rotation then says where the second camera is: at a distance that the box tells, on the ray through
+    its middle. That is one number more than matches have which leave the angle between the views open.
+    """
+    if first is None or second is None:
+        return np.zeros(len(poses))
+    ends = []
+    for outline in (first, second):
+        ray = homogeneous(outline.middle)
+        ends.append(ray / np.linalg.norm(ray) / outline.size)  # inversely proportional to the box
+    chord = ends[1] - poses.rotations @ ends[0]
+    length = np.linalg.norm(chord, axis=1)
+    misfit = np.linalg.norm(np.cross(chord, poses.directions), axis=1)
+    angle = np.arctan2(misfit, (chord * poses.directions).sum(1))
+    relative = length * math.sqrt(first.size * second.size)
+    deviation = np.minimum(DISTANCE_DEVIATION / np.maximum(relative, 1e-9), WIDEST_DIRECTION)
+    tails = (LOOK_AT_FREEDOM + 1) / 2 * np.log1p((angle / deviation) ** 2 / LOOK_AT_FREEDOM)
+    return np.asarray(np.log(WIDEST_DIRECTION / deviation) - tails)
+
+
+def _distinct(poses: Poses, heights: FloatArray) -> tuple[Poses, FloatArray]:
+    """Poses that differ, best first, weighted (S,) by their log probabilities."""
+    posterior = np.exp(heights - heights.max())
     kept: list[int] = []
-    for k in np.argsort(costs, kind="stable").tolist():
+    for k in np.argsort(-heights, kind="stable").tolist():
         apart = so3.angle_between(poses.rotations[kept], poses.rotations[k])
-        if likelihoods[k] > LEAST_POSE_WEIGHT and (apart > SEPARATION).all():
+        if posterior[k] > LEAST_POSE_WEIGHT and (apart > SEPARATION).all():
             kept.append(k)
-    weights = likelihoods[kept] / likelihoods[kept].sum()
+    weights = posterior[kept] / posterior[kept].sum()
     return poses[np.array(kept[:MOST_EXPLANATIONS])], weights[:MOST_EXPLANATIONS]
+
+
+def _extent(rays: FloatArray) -> float:
+    """Standard deviation of rays (K, 2) along the direction in which it is least."""
+    return float(np.sqrt(max(np.linalg.eigvalsh(np.cov(rays.T))[0], 0.0)))
 
 
 def _with_covariances(

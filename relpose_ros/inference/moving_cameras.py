@@ -78,7 +78,7 @@ class MovingCameras:
     def remembered(self, distributions: PairDistributions, places: torch.Tensor) -> torch.Tensor:
         """What the coarse grid remembers of `heights`; no energy is evaluated. -> (G, S, C)."""
         relative = self._relative(places)
-        cells = torch.from_numpy(so3_grid.cells_at(distributions.coarse_level, relative.numpy()))
+        cells = so3_grid.cells_at(distributions.coarse_level, relative)
         known = distributions.coarse[self.pairs]  # (G, O, cells)
         return known.gather(2, cells.flatten(2)).view(cells.shape).sum(1)
 

@@ -9,7 +9,7 @@ from relpose_ros.captures.folder import Frame, load_capture, save_capture
 from relpose_ros.evaluation.match_trust import RIGHT, MatchedPairs, fit_trust, observe
 from relpose_ros.geometry import so3
 from relpose_ros.inference.local_features import find_features
-from relpose_ros.inference.matches import relate, trust
+from relpose_ros.inference.matches import explain, relate, trust
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
 FOCAL, SIDE = 300.0, 160
@@ -61,15 +61,16 @@ def capture(textures, tmp_path_factory):
 
 def test_observes_the_pairs_whose_cameras_are_known(capture):
     pairs = observe(load_capture(capture.folder), masked=True)
-    assert pairs.inliers.shape == (3,)  # nothing matches the plain one
+    assert pairs.signs.shape == (3, 3)  # nothing matches the plain one
     assert pairs.right.tolist() == [True, True, True]
     assert pairs.errors.shape == (3, 3)
     assert pairs.covariances.shape == (3, 3, 3)
     assert np.linalg.norm(pairs.errors, axis=1).max() < RIGHT
-    found = relate(*(find_features(capture.view(k)) for k in (0, 1)))
-    assert pairs.inliers[0] == len(found.inliers)
-    # By the same number the matches say how far to trust themselves.
-    assert found.probability == trust(len(found.inliers))
+    first, second = (find_features(capture.view(k)) for k in (0, 1))
+    explained = explain(first, second)
+    assert pairs.signs[0].tolist() == explained.support.signs.tolist()
+    # By the same numbers the matches say how far to trust themselves.
+    assert relate(first, second).probability == trust(explained.support)
 
 
 def test_a_wrong_pose_on_file_counts_as_wrong(capture, textures, tmp_path):
@@ -82,29 +83,29 @@ def test_a_wrong_pose_on_file_counts_as_wrong(capture, textures, tmp_path):
     assert pairs.covariances.shape == (0, 3, 3)
 
 
-def stated(coefficients, inliers):
-    return 1 / (1 + np.exp(-(coefficients[0] + coefficients[1] * np.log(inliers))))
+def stated(coefficients, signs):
+    return 1 / (1 + np.exp(-(coefficients[0] + signs @ coefficients[1:])))
 
 
 def test_the_regression_finds_the_coefficients_of_its_own_kind():
     generator = np.random.default_rng(0)
-    coefficients = np.array([-8.0, 2.0])
-    inliers = np.exp(generator.uniform(2, 6, 8000))
-    right = generator.uniform(size=8000) < stated(coefficients, inliers)
+    coefficients = np.array([-8.0, 2.0, -1.0])
+    signs = np.stack([generator.uniform(2, 6, 8000), generator.normal(size=8000)], 1)
+    right = generator.uniform(size=8000) < stated(coefficients, signs)
     none = np.zeros((0, 3))
-    found = fit_trust(MatchedPairs(inliers, right, none, none[..., None]))
+    found = fit_trust(MatchedPairs(signs, right, none, none[..., None]))
     np.testing.assert_allclose(found, coefficients, rtol=0.1, atol=0.1)
     # The likelihood's slope vanishes: as many are right as were said to be.
-    assert stated(found, inliers).mean() == pytest.approx(right.mean(), abs=1e-6)
+    assert stated(found, signs).mean() == pytest.approx(right.mean(), abs=1e-6)
 
 
 def test_few_pairs_make_nothing_certain():
     """Perfectly separable: without the ridge the coefficients would have no end."""
-    inliers = np.array([10.0, 12.0, 60.0, 80.0])
+    signs = np.log([[10.0], [12.0], [60.0], [80.0]])
     right = np.array([False, False, True, True])
     none = np.zeros((0, 3))
-    found = fit_trust(MatchedPairs(inliers, right, none, none[..., None]))
+    found = fit_trust(MatchedPairs(signs, right, none, none[..., None]))
     assert np.isfinite(found).all()
-    assert (stated(found, inliers)[right] > 0.8).all()
-    assert (stated(found, inliers)[~right] < 0.2).all()
-    assert np.abs(stated(found, inliers) - right).max() > 0.003
+    assert (stated(found, signs)[right] > 0.8).all()
+    assert (stated(found, signs)[~right] < 0.2).all()
+    assert np.abs(stated(found, signs) - right).max() > 0.003

@@ -13,13 +13,15 @@ from relpose_ros.captures.folder import load_capture
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import homogeneous
 from relpose_ros.inference import matches
-from relpose_ros.inference.local_features import LocalFeatures, find_features
+from relpose_ros.inference.local_features import LocalFeatures, Outline, find_features
 from relpose_ros.inference.matches import (
     LEAST_MATCHES,
     NOTHING,
     Matcher,
     RelativePose,
+    Support,
     TwoViewGeometry,
+    explain,
     peaks,
     relate,
     trust,
@@ -223,10 +225,55 @@ def test_without_a_box_what_stays_in_place_says_nothing(ball_on_a_turntable, rot
 # Trust, and what becomes of it.
 
 
-def test_trust_grows_with_the_inliers():
-    assert trust(100) > trust(50) > trust(25) > 0.5
-    assert 0 < trust(LEAST_MATCHES - 1) < 0.5
-    assert trust(2000) < 1
+def support(inliers=30, residual=0.45, spread=0.8):
+    return Support(inliers, residual, spread)
+
+
+def test_trust_grows_with_what_speaks_for_a_pose():
+    assert trust(support(100)) > trust(support(50)) > trust(support(25)) > 0.5
+    assert 0 < trust(support(LEAST_MATCHES)) < trust(support(25))
+    assert trust(support(10_000)) < 1
+    assert trust(support(residual=0.3)) > trust(support(residual=0.7))
+    assert trust(support(spread=0.9)) > trust(support(spread=0.1))
+    # Nothing of it may be zero, and yet it can be.
+    assert 0 <= trust(support(residual=0.0, spread=0.0)) < 1
+
+
+def test_accidental_matches_support_a_pose_less(point_scene):
+    """Twenty that are right and twenty that happen to obey: equally many, but not equally near."""
+    right = explain(*point_scene.ring([0, 25], points=40).features(noise=0.3))
+    found = [
+        explain(*point_scene.ring([0, 25], points=200, seed=seed).features(outliers=200, seed=seed))
+        for seed in range(6)
+    ]
+    accidental = [each for each in found if each is not None]
+    assert all(right.support.residual < each.support.residual for each in accidental)
+    assert all(trust(each.support) < 0.5 for each in accidental)
+    assert trust(right.support) > 0.9
+
+
+def outlined(features, middle, size):
+    return replace(features, outline=Outline(np.array(middle), size))
+
+
+def test_cameras_that_look_at_the_object_tell_between_explanations(point_scene):
+    """Of nearly orthographic views: the right angle weighs more where the boxes are known."""
+    alone, together = [], []
+    for seed in range(12):
+        scene = point_scene.ring([0, 40], points=150, seed=seed)
+        scene.points *= 0.4
+        views = scene.features(noise=0.5, outliers=30, seed=seed)
+        distances = np.linalg.norm(scene.translations, axis=1)
+        boxes = [
+            outlined(view, local[:2] / local[2], 0.2 / distance)
+            for view, local, distance in zip(views, scene.translations, distances, strict=True)
+        ]
+        for pair, weights in ((views, alone), (boxes, together)):
+            poses = relate(*pair).poses
+            right = [p.weight for p in poses if degrees(p.rotation, scene.relative(0, 1)[0]) < 8]
+            weights.append(sum(right))
+    assert np.mean(together) > np.mean(alone)
+    assert np.log(np.maximum(together, 1e-3)).mean() > np.log(np.maximum(alone, 1e-3)).mean()
 
 
 @pytest.mark.parametrize("roll", [0.0, 2.0, 3.0, -3.2])
