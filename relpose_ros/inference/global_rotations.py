@@ -46,13 +46,13 @@ class AscentSettings:
     """Complete solutions that climb, and are reported."""
     climb_stride: float = math.radians(8)
     """First step of a climb, rad."""
-    climb_steps: int = 16
+    climb_steps: int = 8
     content: float = 0.5
     """Nats a pair. Where the pairs of a scan, or of a camera, are on average this near to their highest
     modes, no other place is looked for: the best could gain no more. Scans whose pairs agree become cheap."""
     torn: float = 1.5
     """The same: beyond it, two cameras join anew and solutions are refined before they are compared."""
-    jumps: int = 4
+    jumps: int = 2
     """Times that cameras may leave for another hill, while that gains anything."""
     jumpers: int = 2
     """Solutions whose cameras may leave for another hill, one by one and two by two."""
@@ -63,7 +63,7 @@ class AscentSettings:
     hop_stride: float = math.radians(3)
     """First step of that climb, rad."""
     hop_steps: int = 4
-    rounds: float = 2
+    rounds: float = 1
     """Times that any two cameras join anew, while that gains anything."""
     joining: int = 2
     """Partial solutions kept while two cameras join anew."""
@@ -79,7 +79,7 @@ class AscentSettings:
     """how many times at most; both are one for a full scan."""
     settled: float = 1e-4
     """Nats: where a polish gains less, another one would gain no more."""
-    last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (10, 6, 4, 3, 2, 1, 0.5, 0.2, 0.08))
+    last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (8, 4, 2, 1, 0.5, 0.2, 0.08))
     """Neighbourhood of each of those sweeps, rad."""
     distinct: float = math.radians(10)
     """Solutions are different where some camera differs by more, rad."""
