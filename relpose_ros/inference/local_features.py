@@ -119,6 +119,7 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
     box = view.box
     full = box.x0 <= 0 and box.y0 <= 0 and box.x1 >= view.full_width and box.y1 >= view.full_height
     corners = (np.array([[box.x0, box.y0], [box.x1, box.y1]]) - [intrinsics.cx, intrinsics.cy]) / focal
+    corners = _straightened(corners, view.distortion)
     return LocalFeatures(
         *(rays, orientations, descriptors, places, plain, pixel),
         guessed=view.intrinsics is None,
