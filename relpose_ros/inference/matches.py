@@ -216,7 +216,8 @@ def trust(support: Support) -> float:
     """Probability that one of a pair's poses is right, learned from pairs whose pose is known.
 
     Logistic, fitted by `benchmarks/match_trust.py` on the photographs that the shipped network was trained on
-    (ascott_hound, buddha, socketed_axe) and on eight rendered captures, boxes alone.
+    (ascott_hound, buddha, socketed_axe) and on eight rendered captures of held-out objects, by boxes alone:
+    photographs know few of the plain and repetitive surfaces that accidental matches come from.
     """
     bias, *slopes = TRUST
     return LARGEST_TRUST / (1 + math.exp(-(bias + float(support.signs @ slopes))))
