@@ -54,7 +54,7 @@ proportion."""
 PLANAR_SHARE = 0.8
 """Of the matches, explained by one homography: from here on the points may lie on a plane, which two poses
 explain equally well, or the camera may only have turned."""
-TRUST = (-8.01, 2.33, -3.09, 2.51)
+TRUST = (-7.98, 2.31, -3.15, 2.54)
 """Coefficients of `trust`: the bias, and those of `Support.signs`."""
 LARGEST_TRUST = 0.995
 """No captures are enough to learn how rare the rarest mistakes are."""
