@@ -35,7 +35,7 @@ class AscentSettings:
 
     full_scan: int = 28
     """Pairs that those numbers are meant for, 8 views."""
-    most: int = 64
+    most: int = 32
     beam: int = 8
     """Partial solutions kept while cameras join."""
     screened: int = 5
@@ -64,18 +64,18 @@ class AscentSettings:
     """First step of that climb, rad."""
     hop_steps: int = 4
     rounds: float = 1
-    """Times that any two cameras join anew, while that gains anything."""
+    """Times that any two cameras join anew, while that gains anything, at least once."""
     joining: int = 2
     """Partial solutions kept while two cameras join anew."""
     finalists: int = 2
     """Solutions that are refined."""
-    turns: float = 0.4
+    turns: float = 0.2
     """Times that they are, each time in other directions, at least once."""
     radii: tuple[float, ...] = tuple(math.radians(a) for a in (12, 6, 3))
     """Neighbourhood of each sweep over their cameras, rad."""
-    winners: int = 4
+    winners: int = 2
     """Solutions that are polished at the end, and"""
-    polishes: int = 5
+    polishes: int = 2
     """how many times at most; both are one for a full scan."""
     settled: float = 1e-4
     """Nats: where a polish gains less, another one would gain no more."""
