@@ -14,7 +14,7 @@ import numpy as np
 
 from relpose_ros.geometry import so3
 from relpose_ros.inference.local_features import find_features
-from relpose_ros.inference.matches import explain
+from relpose_ros.inference.matches import TRUST, explain
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -63,7 +63,7 @@ def observe(capture: Capture, *, masked: bool) -> MatchedPairs:
                 errors.append(turns[best])
                 covariances.append(explained.poses[best].covariance)
     return MatchedPairs(
-        np.array(signs).reshape(len(signs), -1),
+        np.array(signs).reshape(-1, len(TRUST) - 1),
         np.array(right, bool),
         np.array(errors).reshape(-1, 3),
         np.array(covariances).reshape(-1, 3, 3),

@@ -10,6 +10,7 @@ Image coordinates are rays (x / z, y / z) of the pinhole camera.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,6 +81,16 @@ class LocalFeatures:
     """Whether neither box nor mask tells the object from what stands around it, although they should."""
     outline: Outline | None = None
     """None where the box is the whole picture, which says nothing of the object."""
+
+    @cached_property
+    def extent(self) -> float:
+        """`extent` of all rays, the same for every pair of the view."""
+        return extent(self.rays)
+
+
+def extent(rays: FloatArray) -> float:
+    """Standard deviation of rays (K, 2) along the direction in which it is least."""
+    return float(np.sqrt(max(np.linalg.eigvalsh(np.cov(rays.T))[0], 0.0)))
 
 
 def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:

@@ -22,7 +22,7 @@ from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import homogeneous
 from relpose_ros.inference import epipolar
 from relpose_ros.inference.epipolar import Poses
-from relpose_ros.inference.local_features import find_features, match
+from relpose_ros.inference.local_features import extent, find_features, match
 from relpose_ros.inference.rotation_evidence import Peak
 from relpose_ros.inference.uncertainty import BASIN
 
@@ -116,7 +116,7 @@ class Support:
 
     @property
     def signs(self) -> FloatArray:
-        """(3,) logarithms, as the logistic regression takes them."""
+        """(3,) logarithms, as the logistic regression takes them; residual and spread may be zero."""
         return np.log([self.inliers, self.residual + 0.05, self.spread + 0.02])
 
 
@@ -202,7 +202,7 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
     if first.guessed or second.guessed:
         stated = tuple(_widened(pose) for pose in stated)
     spread = min(
-        _extent(features.rays[inliers[:, view]]) / max(_extent(features.rays), 1e-12)
+        extent(features.rays[inliers[:, view]]) / max(features.extent, 1e-12)
         for view, features in enumerate((first, second))
     )
     return Explanation(
@@ -313,11 +313,6 @@ def _distinct(poses: Poses, heights: FloatArray) -> tuple[Poses, FloatArray]:
             kept.append(k)
     weights = posterior[kept] / posterior[kept].sum()
     return poses[np.array(kept[:MOST_EXPLANATIONS])], weights[:MOST_EXPLANATIONS]
-
-
-def _extent(rays: FloatArray) -> float:
-    """Standard deviation of rays (K, 2) along the direction in which it is least."""
-    return float(np.sqrt(max(np.linalg.eigvalsh(np.cov(rays.T))[0], 0.0)))
 
 
 def _with_covariances(

@@ -83,6 +83,13 @@ def test_a_wrong_pose_on_file_counts_as_wrong(capture, textures, tmp_path):
     assert pairs.covariances.shape == (0, 3, 3)
 
 
+def test_pictures_that_do_not_match_are_no_pairs(textures, tmp_path):
+    plain = [Frame(*photograph(np.full_like(textures, 90), turn)) for turn in TURNS]
+    pairs = observe(save_capture(tmp_path / "plain", plain), masked=True)
+    assert pairs.right.shape == (0,)
+    assert pairs.signs.shape == (0, 3)
+
+
 def stated(coefficients, signs):
     return 1 / (1 + np.exp(-(coefficients[0] + signs @ coefficients[1:])))
 

@@ -231,7 +231,7 @@ def support(inliers=30, residual=0.45, spread=0.8):
 
 def test_trust_grows_with_what_speaks_for_a_pose():
     assert trust(support(100)) > trust(support(50)) > trust(support(25)) > 0.5
-    assert 0 < trust(support(LEAST_MATCHES)) < trust(support(25))
+    assert 0 < trust(support(LEAST_MATCHES - 1)) < 0.5
     assert trust(support(10_000)) < 1
     assert trust(support(residual=0.3)) > trust(support(residual=0.7))
     assert trust(support(spread=0.9)) > trust(support(spread=0.1))
@@ -240,13 +240,14 @@ def test_trust_grows_with_what_speaks_for_a_pose():
 
 
 def test_accidental_matches_support_a_pose_less(point_scene):
-    """Twenty that are right and twenty that happen to obey: equally many, but not equally near."""
+    """Points seen twice, and pictures that have none in common: those obey some pose, but not as nearly."""
     right = explain(*point_scene.ring([0, 25], points=40).features(noise=0.3))
     found = [
-        explain(*point_scene.ring([0, 25], points=200, seed=seed).features(outliers=200, seed=seed))
-        for seed in range(6)
+        explain(*point_scene.ring([0, 25], points=4000, seed=seed).features(outliers=4000, seed=seed))
+        for seed in range(5)
     ]
     accidental = [each for each in found if each is not None]
+    assert accidental
     assert all(right.support.residual < each.support.residual for each in accidental)
     assert all(trust(each.support) < 0.5 for each in accidental)
     assert trust(right.support) > 0.9
