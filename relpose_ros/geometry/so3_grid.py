@@ -25,6 +25,8 @@ BASE_TILTS = 6
 BASE_CELLS = 12 * BASE_TILTS
 MAX_LEVEL = 8
 """1.2 thousand million cells: beyond it an index would still be exact, an array of cells would not fit."""
+LAST_TABULATED = 3
+"""Centres of whole levels are kept up to this one, 2.7 MB, and looked up."""
 
 
 def size(level: int) -> int:
@@ -37,7 +39,7 @@ def size(level: int) -> int:
 @lru_cache(maxsize=8)
 def grid(level: int) -> FloatArray:
     """Centres of all cells of a level, read-only. -> (72 * 8^level, 3, 3)."""
-    rotations = cell_rotations(level, np.arange(size(level)))
+    rotations = _centres(level, np.arange(size(level)))
     rotations.flags.writeable = False
     return rotations
 
@@ -57,12 +59,17 @@ def cell_spacing(level: int) -> float:
 
 
 def cell_rotations(level: int, cells: npt.ArrayLike) -> FloatArray:
-    """Centres of the given cells of a level. (K,) indices -> (K, 3, 3)."""
-    rest = np.asarray(cells, np.int64)
-    if rest.size and not (rest.min() >= 0 and rest.max() < size(level)):
+    """Centres of the given cells of a level. (...) indices -> (..., 3, 3)."""
+    asked = np.asarray(cells, np.int64)
+    if asked.size and not (asked.min() >= 0 and asked.max() < size(level)):
         raise ValueError(
             f"Level {level} of the rotation grid has {size(level)} cells; an index lies outside."
         )
+    return grid(level)[asked] if level <= LAST_TABULATED else _centres(level, asked)
+
+
+def _centres(level: int, cells: IntArray) -> FloatArray:
+    rest = cells
     column, row, tilt = np.zeros_like(rest), np.zeros_like(rest), np.zeros_like(rest)
     for bit in range(level):
         digit = rest & 7

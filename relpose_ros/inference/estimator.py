@@ -28,6 +28,7 @@ from relpose_ros.inference.predictions import predicted_translations, regressed_
 from relpose_ros.inference.refined_poses import settle
 from relpose_ros.inference.robot_frame import RobotFrame, find_robot_frame
 from relpose_ros.inference.rotation_evidence import RotationEvidence
+from relpose_ros.inference.side_by_side import side_by_side
 from relpose_ros.inference.uncertainty import (
     camera_covariances,
     covariances_of_unknown_trust,
@@ -372,16 +373,20 @@ class Estimator:
         return None if after < before - LARGEST_LOSS * found.energies.count else refined
 
     def _features(self, scan: Scan) -> SceneFeatures:
-        looks = []
-        for view in scan.views:
-            if view not in self._looks:
-                image, crop_parameters = crop_view(view, self._network.preset)
-                # One view at a time: a batch of another size may round differently, and a scan's answer
-                # must not depend on how many of its views arrived together.
-                self._looks[view] = (self._network.look(image[None])[0], crop_parameters)
-            looks.append(self._looks[view])
+        new = [view for view in dict.fromkeys(scan.views) if view not in self._looks]
+        # One view at a time: a batch of another size may round differently, and a scan's answer must not
+        # depend on how many of its views arrived together.
+        several = side_by_side if self.preset.small_convolutions else map
+        for view, look in zip(new, several(self._look, new), strict=True):
+            self._looks[view] = look
+        looks = [self._looks[view] for view in scan.views]
         stacked = torch.stack([crop_parameters for _, crop_parameters in looks])
         return self._network.relate(ViewFeatures.stack([look for look, _ in looks]), stacked)
+
+    @torch.no_grad()
+    def _look(self, view: View) -> tuple[ViewFeatures, torch.Tensor]:
+        image, crop_parameters = crop_view(view, self.preset)
+        return self._network.look(image[None])[0], crop_parameters
 
     def _matcher_of(self, evidence: EvidenceSettings) -> Matcher | None:
         alone = self._regresses or evidence.use == "network"

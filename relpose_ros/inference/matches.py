@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import torch
 
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import homogeneous
@@ -24,6 +22,7 @@ from relpose_ros.inference import epipolar
 from relpose_ros.inference.epipolar import Poses
 from relpose_ros.inference.local_features import extent, find_features, match
 from relpose_ros.inference.rotation_evidence import Peak
+from relpose_ros.inference.side_by_side import side_by_side
 from relpose_ros.inference.uncertainty import BASIN
 
 if TYPE_CHECKING:
@@ -383,11 +382,10 @@ class Matcher:
         known = {(i, j): self._pairs.setdefault(views[i], WeakKeyDictionary()) for i, j in pairs}
         new = [(i, j) for i, j in pairs if views[j] not in known[i, j]]
         unseen = dict.fromkeys(views[view] for pair in new for view in pair)  # each once, in order
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-            features = dict(zip(unseen, pool.map(self.features, unseen), strict=True))
-            found = pool.map(lambda pair: relate(*(features[views[view]] for view in pair)), new)
-            for (i, j), geometry in zip(new, found, strict=True):
-                known[i, j][views[j]] = geometry
+        features = dict(zip(unseen, side_by_side(self.features, unseen), strict=True))
+        found = side_by_side(lambda pair: relate(*(features[views[view]] for view in pair)), new)
+        for (i, j), geometry in zip(new, found, strict=True):
+            known[i, j][views[j]] = geometry
         return {(i, j): known[i, j][views[j]] for i, j in pairs}
 
 

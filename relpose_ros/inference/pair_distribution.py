@@ -12,9 +12,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from relpose_ros.geometry import so3, so3_grid
+from relpose_ros.inference.pair_energies import cell_centres
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -107,13 +109,15 @@ def search(
         coarse = coarse.scatter_reduce(1, ancestors, values.double(), "amax")
     kept.append((level, cells, values))
 
-    rotations = torch.cat([_rotations(at, index) for at, index, _ in kept], 1)
+    rotations = torch.cat([cell_centres(at, index) for at, index, _ in kept], 1)
     blurred = torch.cat([value for _, _, value in kept], 1).double()
     left = [energies.at_centres(at, index, value) for at, index, value in kept[:-1]]
     scores = torch.cat([*left, values], 1).double()
-    levels = [at for at, index, _ in kept for _ in range(index.shape[1])]
-    log_volumes = torch.tensor([-math.log(so3_grid.size(at)) for at in levels], dtype=torch.float64)
-    spacings = torch.tensor([so3_grid.cell_spacing(at) for at in levels], dtype=torch.float64)
+    volumes = [1 / so3_grid.size(at) for at, _, _ in kept]
+    edges = [so3_grid.cell_spacing(at) for at, _, _ in kept]
+    counts = torch.tensor([index.shape[1] for _, index, _ in kept])
+    log_volumes = torch.tensor(volumes, dtype=torch.float64).log().repeat_interleave(counts)
+    spacings = torch.tensor(edges, dtype=torch.float64).repeat_interleave(counts)
     tops, heights = highest_apart(rotations, blurred, settings.modes, settings.separation)
     modes, mode_energies = _refine_modes(
         energies, pick(rotations, tops), heights, spacings[tops] / 2, settings
@@ -121,11 +125,6 @@ def search(
     return PairDistributions(
         rotations, scores, log_volumes, spacings, coarse, settings.level, modes, mode_energies
     )
-
-
-def _rotations(level: int, cells: torch.Tensor) -> torch.Tensor:
-    """Centres of cells. (..., C) int64 -> (..., C, 3, 3)."""
-    return torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
 
 
 def pick(rotations: torch.Tensor, positions: torch.Tensor) -> torch.Tensor:
@@ -148,7 +147,8 @@ def highest_apart(
         Positions (P, <= M) int64, highest first, and values (P, <= M), -inf where a row has no more.
     """
     least_trace = 1 + 2 * math.cos(separation)
-    flat = rotations.reshape(*values.shape, -1, 9)  # the trace of A B^T is their scalar product
+    # (P, N, L, 9): the trace of A B^T is their scalar product.
+    flat = rotations.reshape(*values.shape, -1, 9).transpose(1, 2).contiguous()
     left = values.clone()
     rows = torch.arange(len(flat))
     tops, heights = [], []
@@ -156,8 +156,8 @@ def highest_apart(
         best = left.argmax(1)
         tops.append(best)
         heights.append(left[rows, best])
-        traces = torch.einsum("plna,pna->pln", flat, flat[rows, best]).amin(2)
-        left = left.masked_fill(traces > least_trace, -math.inf)
+        traces = (flat @ flat[rows, :, best][..., None])[..., 0].amin(1)
+        left.masked_fill_(traces > least_trace, -math.inf)
         left[rows, best] = -math.inf
     return torch.stack(tops, 1), torch.stack(heights, 1)
 
@@ -220,9 +220,25 @@ def ascend(
     return here, value
 
 
+_EYE = torch.eye(3, dtype=torch.float64)
+_HAT = torch.from_numpy(so3.hat(np.eye(3)).reshape(3, 9))
+"""From a vector, a row, to the rows of its skew matrix."""
+
+
 def turned(rotations: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """``exp(w) R``. (..., 3, 3), (..., 3) -> (..., 3, 3)."""
-    return torch.from_numpy(so3.exp(vectors.numpy())) @ rotations
+    """``exp(w) R``. (..., 3, 3), (..., 3) -> (..., 3, 3).
+
+    As `so3.exp`, in torch: a climb asks for a few at every step.
+    """
+    angle = vectors.norm(dim=-1)[..., None, None]
+    skew = (vectors @ _HAT).view(*vectors.shape, 3)
+    outer = vectors[..., :, None] * vectors[..., None, :]
+    # Rodrigues; sinc(x) is sin(pi x) / (pi x), and exact at zero.
+    halved = torch.sinc(angle / math.tau)
+    turn: torch.Tensor = (
+        angle.cos() * _EYE + torch.sinc(angle / math.pi) * skew + 0.5 * halved * halved * outer
+    )
+    return turn @ rotations
 
 
 def turned_back(rotations: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:

@@ -19,8 +19,6 @@ from relpose_ros.geometry import so3_grid
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    import numpy.typing as npt
-
     from relpose_ros.inference.rotation_evidence import RotationEvidence
 
 COARSE_LEVEL = 1
@@ -84,8 +82,7 @@ class GridEmbeddings:
         """Embeddings of some cells of a level. (..., C) int64 -> (..., C, H)."""
         if level <= LAST_KEPT_LEVEL:
             return self(level)[cells]
-        rotations = torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
-        return self._head.embed(rotations)
+        return self._head.embed(cell_centres(level, cells))
 
     def __call__(self, level: int) -> torch.Tensor:
         """(72 * 8^level, H) embeddings of a whole level."""
@@ -183,14 +180,12 @@ class PairEnergies:
     def on_level(self, grid: GridEmbeddings, level: int) -> torch.Tensor:
         """Energies of every pair on a whole level. -> (P, 72 * 8^level)."""
         known = self.coarse if level == COARSE_LEVEL else None
-        return self._at_cells(
-            level, self.on_grid(grid(level)) if known is None else known, so3_grid.grid(level)
-        )
+        learned = self.on_grid(grid(level)) if known is None else known
+        return self._at_cells(level, learned, torch.arange(so3_grid.size(level)))
 
     def on_cells(self, grid: GridEmbeddings, level: int, cells: torch.Tensor) -> torch.Tensor:
         """Energies of every pair at its own cells of a level. (P, C) int64 -> (P, C)."""
-        centres = so3_grid.cell_rotations(level, cells.numpy())
-        return self._at_cells(level, self._learned_on_cells(grid, level, cells), centres)
+        return self._at_cells(level, self._learned_on_cells(grid, level, cells), cells)
 
     def at_centres(self, level: int, cells: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         """What `on_cells` gave, without the blur of the evidence. (P, C) twice -> (P, C).
@@ -201,7 +196,7 @@ class PairEnergies:
         if self.evidence is None:
             return values
         pairs = torch.arange(self.count)
-        rotations = torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
+        rotations = cell_centres(level, cells)
         blurred = self.evidence(pairs, rotations, so3_grid.cell_spacing(level) / 2)
         return values + (self.evidence(pairs, rotations) - blurred).to(values.dtype)
 
@@ -241,12 +236,12 @@ class PairEnergies:
         skew = turns - turns.mT
         return values, torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
-    def _at_cells(self, level: int, learned: torch.Tensor, centres: npt.NDArray[np.float64]) -> torch.Tensor:
+    def _at_cells(self, level: int, learned: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
         """From the network's energies of a level's cells to those of all evidence."""
         calibrated = self._calibrated(learned, slice(None))
         if self.evidence is None:
             return calibrated
-        rotations, blur = torch.from_numpy(np.array(centres)), so3_grid.cell_spacing(level) / 2
+        rotations, blur = cell_centres(level, cells), so3_grid.cell_spacing(level) / 2
         return calibrated + self.evidence(torch.arange(self.count), rotations, blur).to(calibrated.dtype)
 
     def _learned_on_cells(self, grid: GridEmbeddings, level: int, cells: torch.Tensor) -> torch.Tensor:
@@ -272,6 +267,11 @@ class PairEnergies:
             return slopes
         log_odds = energies / self.temperature + self.log_share[pairs, None] - math.log(self.flat)
         return slopes * torch.sigmoid(log_odds)
+
+
+def cell_centres(level: int, cells: torch.Tensor) -> torch.Tensor:
+    """Rotations in the middle of cells. (...) int64 -> (..., 3, 3) float64."""
+    return torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
 
 
 def _joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:

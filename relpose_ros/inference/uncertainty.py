@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -66,38 +66,43 @@ def describe_pairs(
     solved = solution[energies.j] @ solution[energies.i].mT
     masses = distributions.masses(calibration.temperature, calibration.flat)
     entropies = -(masses * (masses.clamp_min(1e-300).log() - distributions.log_volumes)).sum(1)
-    found = [_basins(distributions, pair, mass) for pair, mass in enumerate(masses)]
-    orders = [torch.argsort(basins.sum(1), descending=True, stable=True) for _, _, basins in found]
-    heaviest = torch.stack([centres[order[0]] for (centres, _, _), order in zip(found, orders, strict=True)])
-    covariances = _second_moments(distributions, heaviest, masses)
+    basins = _basins(distributions, masses)
+    weights, by_weight = basins.weights.sort(dim=1, descending=True, stable=True)
+    told = weights >= LEAST_MODE_WEIGHT
+    told[:, 0] = True
+    spreads = np.array([_spread(energies, pair, calibration) for pair in range(energies.count)])
+    cores = _cores(distributions, basins, torch.zeros_like(told).scatter_(1, by_weight, told))
+    cores = np.take_along_axis(cores, by_weight.numpy()[..., None, None], 1) * spreads[:, None, None, None]
+    centres = pick(distributions.modes, by_weight)
+    covariances = _second_moments(distributions, centres[:, 0], masses) * spreads[:, None, None]
+    within = _share(distributions, masses, centres[:, 0])
+    agreeing = _share(distributions, masses, solved)
+    to_modes = _to_modes(distributions, solved[:, None]).amin((1, 2))
     pairs = []
-    for pair, ((centres, angles, basins), by_weight) in enumerate(zip(found, orders, strict=True)):
-        mass, weights = masses[pair], basins.sum(1)
-        # Fitted where the network speaks alone; the width of a matched peak is fitted by itself.
-        spoken = Evidence.GEOMETRIC in _evidence(energies, pair)
-        spread = 1.0 if spoken else calibration.pair_spread
-        strongest = int(by_weight[0])
-        told = by_weight[(weights[by_weight] >= LEAST_MODE_WEIGHT) | (by_weight == strongest)]
-        cores = _cores(distributions, pair, centres[told], basins[told]) * spread
+    for pair, known in enumerate(told.sum(1).tolist()):
         modes = tuple(
-            Mode(camera_j_from_camera_i=centres[mode].numpy(), weight=float(weights[mode]), covariance=core)
-            for mode, core in zip(told.tolist(), cores, strict=True)
+            Mode(camera_j_from_camera_i=centre, weight=weight, covariance=core)
+            for centre, weight, core in zip(
+                centres[pair, :known].numpy(),
+                weights[pair, :known].tolist(),
+                cores[pair, :known],
+                strict=True,
+            )
         )
-        ambiguous = len(modes) > 1 and modes[1].weight >= RUNNER_UP_WEIGHT
-        to_solution = _angles(distributions.rotations[pair], solved[pair : pair + 1])[:, 0]
+        ambiguous = known > 1 and modes[1].weight >= RUNNER_UP_WEIGHT
         pairs.append(
             PairRotation(
                 i=int(energies.i[pair]),
                 j=int(energies.j[pair]),
                 camera_j_from_camera_i=modes[0].camera_j_from_camera_i,
-                covariance=covariances[pair] * spread,
+                covariance=covariances[pair],
                 entropy=float(entropies[pair]),
-                probability_within_15_deg=_share(angles[:, strongest], mass, distributions.spacings),
+                probability_within_15_deg=float(within[pair]),
                 modes=modes,
                 ambiguous=ambiguous,
                 ambiguity_angle=_angle(modes[0], modes[1]) if ambiguous else 0.0,
-                solution_probability=_share(to_solution, mass, distributions.spacings),
-                solution_angle=float(_angles(solved[pair : pair + 1], centres).min()),
+                solution_probability=float(agreeing[pair]),
+                solution_angle=float(to_modes[pair]),
                 evidence=_evidence(energies, pair),
             )
         )
@@ -106,10 +111,7 @@ def describe_pairs(
 
 def heaviest_modes(distributions: PairDistributions) -> PairDistributions:
     """The same distributions with nothing but the mode of each pair that owns the most probability."""
-    weights = [
-        _basins(distributions, pair, mass)[2].sum(1) for pair, mass in enumerate(distributions.masses())
-    ]
-    heaviest = torch.stack([each.argmax() for each in weights])[:, None]
+    heaviest = _basins(distributions, distributions.masses()).weights.argmax(1, keepdim=True)
     return replace(
         distributions,
         modes=pick(distributions.modes, heaviest),
@@ -146,15 +148,34 @@ def pairs_of_unknown_trust(rotations: FloatArray) -> tuple[PairRotation, ...]:
     return tuple(pairs)
 
 
-def _basins(
-    distributions: PairDistributions, pair: int, mass: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A pair's modes (M, 3, 3), their angles to the cells (L, M), and the masses that each owns (M, L)."""
-    centres = distributions.modes[pair][distributions.mode_energies[pair] > -math.inf]
-    angles = _angles(distributions.rotations[pair], centres)
-    nearest = angles.argmin(1)
-    owned = _inside(angles.min(1).values, BASIN, distributions.spacings) * mass
-    return centres, angles, owned * (nearest[None] == torch.arange(len(centres))[:, None])
+@dataclass(frozen=True, eq=False)
+class _Basins:
+    """Who owns the masses of P pairs in L cells, of M modes."""
+
+    owners: torch.Tensor
+    """(P, L) int64, the mode nearest to each cell."""
+    owned: torch.Tensor
+    """(P, L) what it owns of the cell's mass."""
+    weights: torch.Tensor
+    """(P, M) what each mode owns."""
+
+
+def _basins(distributions: PairDistributions, masses: torch.Tensor) -> _Basins:
+    angles, owners = _to_modes(distributions, distributions.rotations).min(2)
+    owned = _inside(angles, BASIN, distributions.spacings) * masses
+    weights = torch.zeros_like(distributions.mode_energies).scatter_add_(1, owners, owned)
+    return _Basins(owners, owned, weights)
+
+
+def _to_modes(distributions: PairDistributions, rotations: torch.Tensor) -> torch.Tensor:
+    """Angles to each pair's modes, infinite to those that it has not. (P, K, 3, 3) -> (P, K, M) rad."""
+    lacking = distributions.mode_energies == -math.inf
+    return _angles(rotations, distributions.modes).masked_fill(lacking[:, None], math.inf)
+
+
+def _spread(energies: PairEnergies, pair: int, calibration: Calibration) -> float:
+    """Fitted where the network speaks alone; the width of a matched peak is fitted by itself."""
+    return 1.0 if Evidence.GEOMETRIC in _evidence(energies, pair) else calibration.pair_spread
 
 
 def _evidence(energies: PairEnergies, pair: int) -> Evidence:
@@ -168,8 +189,8 @@ def _angle(a: Mode, b: Mode) -> float:
 
 
 def _angles(rotations: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
-    """Angles in rad. (L, 3, 3), (M, 3, 3) -> (L, M)."""
-    traces = rotations.flatten(1) @ centres.flatten(1).T
+    """Angles in rad. (P, L, 3, 3), (P, M, 3, 3) -> (P, L, M)."""
+    traces = rotations.flatten(2) @ centres.flatten(2).mT
     return ((traces - 1) / 2).clamp(-1, 1).acos()
 
 
@@ -178,8 +199,10 @@ def _inside(angles: torch.Tensor, radius: float, spacings: torch.Tensor) -> torc
     return ((radius - angles) / spacings + 0.5).clamp(0, 1)
 
 
-def _share(angles: torch.Tensor, mass: torch.Tensor, spacings: torch.Tensor) -> float:
-    return float((_inside(angles, WITHIN, spacings) * mass).sum())
+def _share(distributions: PairDistributions, masses: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
+    """Probability within 15 degrees of one rotation for each pair. (P, L), (P, 3, 3) -> (P,)."""
+    angles = _angles(distributions.rotations, rotations[:, None])[..., 0]
+    return (_inside(angles, WITHIN, distributions.spacings) * masses).sum(1)
 
 
 def _second_moments(
@@ -189,48 +212,45 @@ def _second_moments(
 
     (P, 3, 3), (P, L) -> (P, 3, 3) rad^2.
     """
-    used = masses > 1e-9 * masses.amax(1, keepdim=True)  # logarithms of the rest would be work for nothing
-    pairs, cells = used.nonzero(as_tuple=True)
-    vectors = _turns((distributions.rotations[pairs, cells] @ centres[pairs].mT).numpy())
-    weights = masses[used].numpy()
-    squares = (vectors[:, :, None] * (weights[:, None] * vectors)[:, None, :]).reshape(-1, 9)
-    starts = np.searchsorted(pairs.numpy(), np.arange(len(masses)))
-    totals = np.add.reduceat(weights, starts)
-    sums = np.add.reduceat(squares, starts)
-    return np.asarray((sums / totals[:, None]).reshape(-1, 3, 3) + _least_moment(distributions))
+    from_centres = (distributions.rotations.flatten(1, 2) @ centres.mT).view_as(distributions.rotations)
+    vectors = _turns(from_centres)
+    moments = (masses[..., None] * vectors).mT @ vectors / masses.sum(1)[:, None, None]
+    return moments.numpy() + _least_moment(distributions)
 
 
-def _cores(
-    distributions: PairDistributions, pair: int, centres: torch.Tensor, basins: torch.Tensor
-) -> FloatArray:
-    """As `_second_moments`, of the cores of one pair's modes. -> (M, 3, 3) rad^2.
+def _cores(distributions: PairDistributions, basins: _Basins, told: torch.Tensor) -> FloatArray:
+    """As `_second_moments`, of the cores of some of the modes. (P, M) bool -> (P, M, 3, 3) rad^2, else zero.
 
     The further out, the less the mass counts.
 
     The scatter of the Student's t that suits the masses best (Kent and Tyler 1991), in the measure in which a
     Gaussian has its own covariance. A few near misses, degrees off, would be most of a second moment, and
     hide how exact the rest is.
-
-    Args:
-        distributions: of the pairs.
-        pair: the one.
-        centres: (M, 3, 3) of its modes.
-        basins: (M, L) the masses that each owns; a cell has one owner at most.
     """
-    owned, owners = basins.max(0)
-    used = owned > 1e-9 * owned.max()
-    from_owner = distributions.rotations[pair][used] @ centres[owners[used]].mT
-    vectors = _turns(from_owner.numpy())
+    used = basins.owned > 1e-9 * basins.owned.amax(1, keepdim=True)
+    pairs, cells = (used & told.gather(1, basins.owners)).nonzero(as_tuple=True)
+    # The cells of one mode together.
+    by_mode, order = (pairs * told.shape[1] + basins.owners[pairs, cells]).sort(stable=True)
+    modes, starts, group = np.unique(by_mode.numpy(), return_index=True, return_inverse=True)
+    pairs, cells = pairs[order], cells[order]
+    owners = basins.owners[pairs, cells]
+    from_owner = distributions.rotations[pairs, cells] @ distributions.modes[pairs, owners].mT
+    vectors = _turns(from_owner).numpy()
     squares = (vectors[:, :, None] * vectors[:, None, :]).reshape(-1, 9)
-    share = (basins[:, used] / basins[:, used].sum(1, keepdim=True)).numpy()
+    share = basins.owned[pairs, cells].numpy()
+    share = share / np.add.reduceat(share, starts)[group]
     least = _least_moment(distributions).reshape(9)
-    scatter = share @ squares + least
+    scatter = np.add.reduceat(share[:, None] * squares, starts) + least
     for _ in range(CORE_ROUNDS):
         information = np.linalg.inv(scatter.reshape(-1, 3, 3)).reshape(-1, 9)
-        weights = share * (FREEDOM + 3) / (FREEDOM + information @ squares.T)
+        distances = np.einsum("ka,ka->k", information[group], squares)
+        weights = share * (FREEDOM + 3) / (FREEDOM + distances)
         # At the end the weights sum to one; made so in every round, they get there sooner (Kent et al. 1994).
-        scatter = weights / weights.sum(1, keepdims=True) @ squares + least
-    return scatter.reshape(-1, 3, 3) / OF_GAUSSIAN
+        weights /= np.add.reduceat(weights, starts)[group]
+        scatter = np.add.reduceat(weights[:, None] * squares, starts) + least
+    cores = np.zeros((told.numel(), 9))
+    cores[modes] = scatter / OF_GAUSSIAN
+    return cores.reshape(*told.shape, 3, 3)
 
 
 def _least_moment(distributions: PairDistributions) -> FloatArray:
@@ -239,36 +259,32 @@ def _least_moment(distributions: PairDistributions) -> FloatArray:
 
 
 def _about(
-    distributions: PairDistributions,
-    energies: PairEnergies,
-    pair: int,
-    relative: torch.Tensor,
-    masses: torch.Tensor,
+    distributions: PairDistributions, energies: PairEnergies, relative: torch.Tensor, masses: torch.Tensor
 ) -> torch.Tensor:
-    """The masses (L,) of a pair that tell how exactly it holds the poses it is right about.
+    """The masses (P, L) that tell how exactly pairs hold the poses they are right about.
 
     Few chances of a gross error, far away, would be most of a second moment. Where matches agree with the
     poses that chance is told apart, as a probability, and only the mass around the poses counts.
     """
-    mass = masses[pair]
-    if energies.evidence is None or not energies.evidence.spoken[pair]:
-        return mass
-    angles = _angles(distributions.rotations[pair], relative[pair : pair + 1])[:, 0]
-    near = _inside(angles, BASIN, distributions.spacings) * mass
-    return near if float(near.sum()) >= SURE else mass
+    if energies.evidence is None:
+        return masses
+    angles = _angles(distributions.rotations, relative[:, None])[..., 0]
+    near = _inside(angles, BASIN, distributions.spacings) * masses
+    sure = torch.tensor(energies.evidence.spoken) & (near.sum(1) >= SURE)
+    return torch.where(sure[:, None], near, masses)
 
 
-def _turns(rotations: FloatArray) -> FloatArray:
-    """As `so3.log`, sooner: straight from the skew part, but where that vanishes. (L, 3, 3) -> (L, 3)."""
-    skew = rotations - rotations.transpose(0, 2, 1)
-    axes = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1) / 2  # of length sin(angle)
-    sine = np.sqrt((axes * axes).sum(1))
-    angle = np.arctan2(sine, (rotations[:, 0, 0] + rotations[:, 1, 1] + rotations[:, 2, 2] - 1) / 2)
-    vectors = axes * (angle / np.maximum(sine, 1e-12))[:, None]
+def _turns(rotations: torch.Tensor) -> torch.Tensor:
+    """As `so3.log`, sooner: straight from the skew part, but where that vanishes. (..., 3, 3) -> (..., 3)."""
+    skew = rotations - rotations.mT
+    axes = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1) / 2  # of length sin(angle)
+    sine = axes.norm(dim=-1)
+    angle = torch.atan2(sine, (rotations.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2)
+    vectors: torch.Tensor = axes * (angle / sine.clamp_min(1e-12))[..., None]
     hard = sine < 1e-3
     if hard.any():
-        vectors[hard] = so3.log(rotations[hard])
-    return np.asarray(vectors)
+        vectors[hard] = torch.from_numpy(so3.log(rotations[hard].numpy()))
+    return vectors
 
 
 def camera_covariances(
@@ -362,8 +378,8 @@ def _joint_spread(
     masses = distributions.masses(calibration.temperature, calibration.flat)
     information = UNTIED * np.eye(3 * energies.views)
     given_back = np.zeros((energies.views, 3, 3))
-    about = [_about(distributions, energies, pair, relative, masses) for pair in range(energies.count)]
-    moments = _second_moments(distributions, relative, torch.stack(about))
+    about = _about(distributions, energies, relative, masses)
+    moments = _second_moments(distributions, relative, about)
     for pair, (i, j) in enumerate(zip(energies.i.tolist(), energies.j.tolist(), strict=True)):
         variances, axes = np.linalg.eigh(moments[pair])
         nothing = axes / np.maximum(variances, UNIFORM_VARIANCE) @ axes.T

@@ -95,6 +95,14 @@ class Preset:
         """Width of a token."""
         return self.pooled_width + self.crop_width
 
+    @property
+    def small_convolutions(self) -> bool:
+        """Whether those of one view are too small for several threads to share.
+
+        Two views on a thread each then take as long as one does on both.
+        """
+        return self.backbone == "efficientnet_lite0"
+
 
 PRESETS = {
     "paper": Preset("paper"),

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relpose_ros.geometry import so3
-from relpose_ros.inference.pair_distribution import SearchSettings, ascend, highest_apart, search
+from relpose_ros.inference.pair_distribution import SearchSettings, ascend, highest_apart, search, turned
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
 
 
@@ -111,3 +111,14 @@ def test_ascent_climbs_and_never_falls():
     ends, heights = ascend(uphill, starts, torch.full((20,), 0.5, dtype=torch.float64), steps=60)
     assert (heights >= height(starts)).all()
     assert np.degrees(so3.angle_between(ends.numpy(), target.numpy())).max() < 1
+
+
+def test_turned_is_the_exponential_times_the_rotation():
+    generator = np.random.default_rng(0)
+    axes = generator.standard_normal((2, 8, 3))
+    axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
+    angles = np.array([0, 1e-12, 1e-5, 1e-3, 0.3, 2.0, math.pi, 5.0])
+    rotations = so3.exp(generator.standard_normal((2, 8, 3)))
+    vectors = axes * angles[:, None]
+    found = turned(torch.from_numpy(rotations), torch.from_numpy(vectors)).numpy()
+    np.testing.assert_allclose(found, so3.exp(vectors) @ rotations, atol=1e-14)

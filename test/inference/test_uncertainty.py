@@ -305,4 +305,4 @@ def test_quick_logarithm_is_the_logarithm():
         0, 1e-9, 1e-4, 1e-3, np.linspace(0.1, 3.1, 32), math.pi - 1e-3, math.pi - 1e-6, math.pi - 1e-9, 3.14
     ]
     rotations = so3.exp(axis * angles[:, None])
-    np.testing.assert_allclose(_turns(rotations), so3.log(rotations), atol=1e-9)
+    np.testing.assert_allclose(_turns(torch.from_numpy(rotations)), so3.log(rotations), atol=1e-9)
