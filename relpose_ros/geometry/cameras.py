@@ -73,16 +73,16 @@ def project_points(
 def closest_point_to_axes(camera_from_world: npt.ArrayLike, centres: npt.ArrayLike) -> FloatArray:
     """The world point with the least summed squared distance to all optical axes (RelPose++, section 3.3).
 
-    (N, 3, 3) and (N, 3) -> (3,). Parallel axes leave it free along themselves: there the answer is
-    the point nearest to the mean of the camera centres.
+    (..., N, 3, 3) and (..., N, 3) -> (..., 3). Parallel axes leave it free along themselves: there the answer
+    is the point nearest to the mean of the camera centres.
     """
-    axes = np.asarray(camera_from_world, np.float64)[:, 2]
+    axes = np.asarray(camera_from_world, np.float64)[..., 2, :]
     c = np.asarray(centres, np.float64)
-    middle = c.mean(0)
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # keeps what is perpendicular to the axis
-    wanted = np.einsum("nij,nj->i", across, c - middle)
-    offset, *_ = np.linalg.lstsq(across.sum(0), wanted, rcond=1e-9)
-    return np.asarray(middle + offset)
+    middle = c.mean(-2)
+    across = np.eye(3) - axes[..., :, None] * axes[..., None, :]  # keeps what is perpendicular to the axis
+    wanted = (across @ (c - middle[..., None, :])[..., None]).sum(-3)
+    offset = np.linalg.pinv(across.sum(-3), rcond=1e-9, hermitian=True) @ wanted
+    return np.asarray(middle + offset[..., 0])
 
 
 def look_at_translations(

@@ -39,12 +39,10 @@ LEAST_POINTS = 12
 LEAST_OBSERVATIONS = 10
 """Of a camera that takes part."""
 LEAST_PARALLAX = math.radians(1.5)
-ROUNDS = ((60.0, 6.0), (6.0, 1.5))
-"""Largest error of a point that takes part, and scale of the robust loss, in pixels: first from poses that
-are degrees off, then from good ones."""
+ROUNDS = ((60.0, 6.0, 1e-2), (6.0, 1.5, 1e-4))
+"""Largest error of a point that takes part, and scale of the robust loss, in pixels; relative fall of the cost
+in a step below which it was the last. First from poses that are degrees off, then from good ones."""
 STEPS = 25
-LEAST_GAIN = 1e-4
-"""Relative fall of the cost in a step below which it was the last."""
 LEAST_INFORMATION = 1e-12
 """On the diagonal of the normal equations, which are then never singular."""
 TRANSLATION_DEVIATION = 0.5
@@ -118,7 +116,7 @@ def refine(
         return None
     here = rotations, translations
     chosen = seen
-    for reach, scale in ROUNDS:
+    for reach, scale, least_gain in ROUNDS:
         points, errors = _triangulate(here, seen)
         good = _well_seen(here, seen, points) & (errors < reach)
         connected = _connected(seen.chosen(_repeated(seen, good)), len(rotations))
@@ -126,7 +124,7 @@ def refine(
             return None
         chosen = connected
         points, _ = _triangulate(here, chosen)
-        here = _adjust(here, points, chosen, scale, (rotations, translations))
+        here = _adjust(here, points, chosen, scale, (rotations, translations), least_gain)
     _, before_errors = _triangulate((rotations, translations), chosen)
     points, after_errors = _triangulate(here, chosen)
     before, after = float(np.median(before_errors)), float(np.median(after_errors))
@@ -297,6 +295,7 @@ def _adjust(
     seen: _Observations,
     scale: float,
     prior: tuple[FloatArray, FloatArray],
+    least_gain: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Levenberg and Marquardt's least squares over the poses that take part, but the first, and all points.
 
@@ -309,7 +308,7 @@ def _adjust(
         there = problem.stepped(here, damping)
         new_cost = problem.cost(there)
         if new_cost < cost:
-            done = cost - new_cost < LEAST_GAIN * cost
+            done = cost - new_cost < least_gain * cost
             here, cost, damping = there, new_cost, max(damping / 10, 1e-9)
             if done:
                 break

@@ -132,11 +132,9 @@ def _about_the_axes(
     size = len(spread)
     jacobian = np.eye(size)
     positions = rows_of(range(len(centres)), 3)
-    for column in range(size):
-        shift = np.zeros((len(centres), 6))
-        shift.reshape(-1)[column] = STEP
-        above, below = (_framed(rotations, centres, sign * shift) for sign in (1.0, -1.0))
-        jacobian[positions, column] = (above - below).reshape(-1) / (2 * STEP)
+    shifts = STEP * np.eye(size).reshape(size, len(centres), 6)
+    above, below = (_framed(rotations, centres, sign * shifts) for sign in (1.0, -1.0))
+    jacobian[positions] = (above - below).reshape(size, -1).T / (2 * STEP)
     framed = jacobian @ spread @ jacobian.T
     if np.trace(framed[np.ix_(positions, positions)]) > np.trace(spread[np.ix_(positions, positions)]):
         return centres, spread
@@ -146,8 +144,8 @@ def _about_the_axes(
 
 
 def _framed(rotations: FloatArray, centres: FloatArray, change: FloatArray) -> FloatArray:
-    """Centres about the point closest to all axes, after changes (M, 6) of positions and rotations."""
-    turned = rotations @ so3.exp(-change[:, 3:])
-    moved = centres + change[:, :3]
-    offsets = moved - cameras.closest_point_to_axes(turned, moved)
-    return np.asarray(offsets / np.linalg.norm(offsets[0]))
+    """Centres about the point closest to all axes, after changes (..., M, 6) of positions and rotations."""
+    turned = rotations @ so3.exp(-change[..., 3:])
+    moved = centres + change[..., :3]
+    offsets = moved - cameras.closest_point_to_axes(turned, moved)[..., None, :]
+    return np.asarray(offsets / np.linalg.norm(offsets[..., :1, :], axis=-1, keepdims=True))

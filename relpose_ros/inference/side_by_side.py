@@ -30,5 +30,5 @@ def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> l
         with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
             return list(pool.map(function, items))
     finally:
-        # What a thread asks for is also what threads yet to be started get. Here all of the pool's have ended.
+        # What a thread asks for is also what threads yet to be started get: once the pool's have all ended.
         torch.set_num_threads(threads)
