@@ -40,7 +40,7 @@ LEAST_OBSERVATIONS = 10
 """Of a camera that takes part."""
 LEAST_PARALLAX = math.radians(1.5)
 ROUNDS = ((60.0, 6.0, 1e-2), (6.0, 1.5, 1e-4))
-"""Largest error of a point that takes part, and scale of the robust loss, in pixels; relative fall of the cost
+"""Largest error of a point that takes part and scale of the robust loss, in pixels; relative fall of the cost
 in a step below which it was the last. First from poses that are degrees off, then from good ones."""
 STEPS = 25
 LEAST_INFORMATION = 1e-12
