@@ -77,7 +77,7 @@ def describe_pairs(
     covariances = _second_moments(distributions, centres[:, 0], masses) * spreads[:, None, None]
     within = _share(distributions, masses, centres[:, 0])
     agreeing = _share(distributions, masses, solved)
-    to_modes = _to_modes(distributions, solved[:, None]).amin((1, 2))
+    to_modes = _nearest_modes(distributions, solved[:, None])[0]
     pairs = []
     for pair, known in enumerate(told.sum(1).tolist()):
         modes = tuple(
@@ -102,7 +102,7 @@ def describe_pairs(
                 ambiguous=ambiguous,
                 ambiguity_angle=_angle(modes[0], modes[1]) if ambiguous else 0.0,
                 solution_probability=float(agreeing[pair]),
-                solution_angle=float(to_modes[pair]),
+                solution_angle=float(to_modes[pair, 0]),
                 evidence=_evidence(energies, pair),
             )
         )
@@ -161,16 +161,20 @@ class _Basins:
 
 
 def _basins(distributions: PairDistributions, masses: torch.Tensor) -> _Basins:
-    angles, owners = _to_modes(distributions, distributions.rotations).min(2)
+    angles, owners = _nearest_modes(distributions, distributions.rotations)
     owned = _inside(angles, BASIN, distributions.spacings) * masses
     weights = torch.zeros_like(distributions.mode_energies).scatter_add_(1, owners, owned)
     return _Basins(owners, owned, weights)
 
 
-def _to_modes(distributions: PairDistributions, rotations: torch.Tensor) -> torch.Tensor:
-    """Angles to each pair's modes, infinite to those that it has not. (P, K, 3, 3) -> (P, K, M) rad."""
+def _nearest_modes(
+    distributions: PairDistributions, rotations: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Angles to each pair's nearest mode, rad, and which it is. (P, K, 3, 3) -> (P, K) twice."""
     lacking = distributions.mode_energies == -math.inf
-    return _angles(rotations, distributions.modes).masked_fill(lacking[:, None], math.inf)
+    traces = _traces(rotations, distributions.modes).masked_fill(lacking[:, None], -math.inf)
+    highest, nearest = traces.max(2)
+    return _turned_by(highest), nearest
 
 
 def _spread(energies: PairEnergies, pair: int, calibration: Calibration) -> float:
@@ -188,9 +192,18 @@ def _angle(a: Mode, b: Mode) -> float:
     return float(so3.angle_between(a.camera_j_from_camera_i, b.camera_j_from_camera_i))
 
 
-def _angles(rotations: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
-    """Angles in rad. (P, L, 3, 3), (P, M, 3, 3) -> (P, L, M)."""
-    traces = rotations.flatten(2) @ centres.flatten(2).mT
+def _angles(rotations: torch.Tensor, centre: torch.Tensor) -> torch.Tensor:
+    """From one rotation for each pair, in rad. (P, L, 3, 3), (P, 3, 3) -> (P, L)."""
+    return _turned_by(_traces(rotations, centre[:, None])[..., 0])
+
+
+def _traces(rotations: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+    """Of all relative rotations. (P, L, 3, 3), (P, M, 3, 3) -> (P, L, M)."""
+    return rotations.flatten(2) @ centres.flatten(2).mT
+
+
+def _turned_by(traces: torch.Tensor) -> torch.Tensor:
+    """The angles of rotations, by their traces."""
     return ((traces - 1) / 2).clamp(-1, 1).acos()
 
 
@@ -201,7 +214,7 @@ def _inside(angles: torch.Tensor, radius: float, spacings: torch.Tensor) -> torc
 
 def _share(distributions: PairDistributions, masses: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
     """Probability within 15 degrees of one rotation for each pair. (P, L), (P, 3, 3) -> (P,)."""
-    angles = _angles(distributions.rotations, rotations[:, None])[..., 0]
+    angles = _angles(distributions.rotations, rotations)
     return (_inside(angles, WITHIN, distributions.spacings) * masses).sum(1)
 
 
@@ -268,7 +281,7 @@ def _about(
     """
     if energies.evidence is None:
         return masses
-    angles = _angles(distributions.rotations, relative[:, None])[..., 0]
+    angles = _angles(distributions.rotations, relative)
     near = _inside(angles, BASIN, distributions.spacings) * masses
     sure = torch.tensor(energies.evidence.spoken) & (near.sum(1) >= SURE)
     return torch.where(sure[:, None], near, masses)
