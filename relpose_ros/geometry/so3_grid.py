@@ -26,7 +26,7 @@ BASE_CELLS = 12 * BASE_TILTS
 MAX_LEVEL = 8
 """1.2 thousand million cells: beyond it an index would still be exact, an array of cells would not fit."""
 LAST_TABULATED = 3
-"""Centres of whole levels are kept up to this one, 2.7 MB, and looked up."""
+"""Centres of whole levels are kept up to this one, 3 MB in all, and looked up."""
 
 
 def size(level: int) -> int:
@@ -39,7 +39,7 @@ def size(level: int) -> int:
 @lru_cache(maxsize=8)
 def grid(level: int) -> FloatArray:
     """Centres of all cells of a level, read-only. -> (72 * 8^level, 3, 3)."""
-    rotations = _centres(level, np.arange(size(level)))
+    rotations = _worked_out(level, np.arange(size(level)))
     rotations.flags.writeable = False
     return rotations
 
@@ -65,11 +65,16 @@ def cell_rotations(level: int, cells: npt.ArrayLike) -> FloatArray:
         raise ValueError(
             f"Level {level} of the rotation grid has {size(level)} cells; an index lies outside."
         )
-    return grid(level)[asked] if level <= LAST_TABULATED else _centres(level, asked)
+    return grid(level)[asked] if level <= LAST_TABULATED else _worked_out(level, asked)
 
 
-def _centres(level: int, cells: IntArray) -> FloatArray:
-    rest = cells
+def centres(level: int, cells: torch.Tensor) -> torch.Tensor:
+    """`cell_rotations` in torch. (...) int64 -> (..., 3, 3) float64."""
+    return torch.from_numpy(cell_rotations(level, cells.numpy()))
+
+
+def _worked_out(level: int, rest: IntArray) -> FloatArray:
+    """Centres of cells, from the digits of their indices. (...) -> (..., 3, 3)."""
     column, row, tilt = np.zeros_like(rest), np.zeros_like(rest), np.zeros_like(rest)
     for bit in range(level):
         digit = rest & 7

@@ -373,20 +373,22 @@ class Estimator:
         return None if after < before - LARGEST_LOSS * found.energies.count else refined
 
     def _features(self, scan: Scan) -> SceneFeatures:
-        new = [view for view in dict.fromkeys(scan.views) if view not in self._looks]
-        # One view at a time: a batch of another size may round differently, and a scan's answer must not
+        # Each view by itself: a batch of another size may round differently, and a scan's answer must not
         # depend on how many of its views arrived together.
-        several = side_by_side if self.preset.small_convolutions else map
-        for view, look in zip(new, several(self._look, new), strict=True):
-            self._looks[view] = look
+        new = [view for view in dict.fromkeys(scan.views) if view not in self._looks]
+        if self.preset.small_convolutions:
+            side_by_side(self._look, new)
+        else:
+            for view in new:
+                self._look(view)
         looks = [self._looks[view] for view in scan.views]
         stacked = torch.stack([crop_parameters for _, crop_parameters in looks])
         return self._network.relate(ViewFeatures.stack([look for look, _ in looks]), stacked)
 
-    @torch.no_grad()
-    def _look(self, view: View) -> tuple[ViewFeatures, torch.Tensor]:
+    @torch.no_grad()  # of the caller's it would not hear in a thread of its own
+    def _look(self, view: View) -> None:
         image, crop_parameters = crop_view(view, self.preset)
-        return self._network.look(image[None])[0], crop_parameters
+        self._looks[view] = (self._network.look(image[None])[0], crop_parameters)
 
     def _matcher_of(self, evidence: EvidenceSettings) -> Matcher | None:
         alone = self._regresses or evidence.use == "network"

@@ -17,7 +17,6 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
 from relpose_ros.geometry import so3, so3_grid
@@ -348,7 +347,8 @@ def _jumped(
     if not restless.any():
         return rotations
     moving, now = moving.only(restless), now[restless]
-    cells = torch.from_numpy(np.array(so3_grid.grid(distributions.coarse_level)))
+    level = distributions.coarse_level
+    cells = so3_grid.centres(level, torch.arange(so3_grid.size(level)))
     modes = moving.where_modes_put(distributions.modes)
     places = torch.cat([modes, cells.expand(*modes.shape[:2], -1, -1, -1)], 2)
     guesses = moving.remembered(distributions, places)

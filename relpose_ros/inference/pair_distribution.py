@@ -16,12 +16,15 @@ import numpy as np
 import torch
 
 from relpose_ros.geometry import so3, so3_grid
-from relpose_ros.inference.pair_energies import cell_centres
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
+
+_EYE = torch.eye(3, dtype=torch.float64)
+_HAT = torch.from_numpy(so3.hat(np.eye(3)).reshape(3, 9))
+"""From a vector, a row, to the rows of its skew matrix."""
 
 
 @dataclass(frozen=True)
@@ -109,14 +112,14 @@ def search(
         coarse = coarse.scatter_reduce(1, ancestors, values.double(), "amax")
     kept.append((level, cells, values))
 
-    rotations = torch.cat([cell_centres(at, index) for at, index, _ in kept], 1)
+    rotations = torch.cat([so3_grid.centres(at, index) for at, index, _ in kept], 1)
     blurred = torch.cat([value for _, _, value in kept], 1).double()
     left = [energies.at_centres(at, index, value) for at, index, value in kept[:-1]]
     scores = torch.cat([*left, values], 1).double()
-    volumes = [1 / so3_grid.size(at) for at, _, _ in kept]
+    volumes = [-math.log(so3_grid.size(at)) for at, _, _ in kept]
     edges = [so3_grid.cell_spacing(at) for at, _, _ in kept]
     counts = torch.tensor([index.shape[1] for _, index, _ in kept])
-    log_volumes = torch.tensor(volumes, dtype=torch.float64).log().repeat_interleave(counts)
+    log_volumes = torch.tensor(volumes, dtype=torch.float64).repeat_interleave(counts)
     spacings = torch.tensor(edges, dtype=torch.float64).repeat_interleave(counts)
     tops, heights = highest_apart(rotations, blurred, settings.modes, settings.separation)
     modes, mode_energies = _refine_modes(
@@ -218,11 +221,6 @@ def ascend(
         value = torch.where(better, new_value, value)
         length = torch.where(better, length * 1.2, length * 0.4)
     return here, value
-
-
-_EYE = torch.eye(3, dtype=torch.float64)
-_HAT = torch.from_numpy(so3.hat(np.eye(3)).reshape(3, 9))
-"""From a vector, a row, to the rows of its skew matrix."""
 
 
 def turned(rotations: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
 import torch
 
 from relpose_ros.geometry import so3_grid
@@ -82,12 +81,12 @@ class GridEmbeddings:
         """Embeddings of some cells of a level. (..., C) int64 -> (..., C, H)."""
         if level <= LAST_KEPT_LEVEL:
             return self(level)[cells]
-        return self._head.embed(cell_centres(level, cells))
+        return self._head.embed(so3_grid.centres(level, cells))
 
     def __call__(self, level: int) -> torch.Tensor:
         """(72 * 8^level, H) embeddings of a whole level."""
         if level not in self._levels:
-            rotations = torch.from_numpy(np.array(so3_grid.grid(level)))
+            rotations = so3_grid.centres(level, torch.arange(so3_grid.size(level)))
             parts = [self._head.embed(part) for part in torch.split(rotations, ROWS)]
             self._levels[level] = torch.cat(parts)
         return self._levels[level]
@@ -196,7 +195,7 @@ class PairEnergies:
         if self.evidence is None:
             return values
         pairs = torch.arange(self.count)
-        rotations = cell_centres(level, cells)
+        rotations = so3_grid.centres(level, cells)
         blurred = self.evidence(pairs, rotations, so3_grid.cell_spacing(level) / 2)
         return values + (self.evidence(pairs, rotations) - blurred).to(values.dtype)
 
@@ -241,7 +240,7 @@ class PairEnergies:
         calibrated = self._calibrated(learned, slice(None))
         if self.evidence is None:
             return calibrated
-        rotations, blur = cell_centres(level, cells), so3_grid.cell_spacing(level) / 2
+        rotations, blur = so3_grid.centres(level, cells), so3_grid.cell_spacing(level) / 2
         return calibrated + self.evidence(torch.arange(self.count), rotations, blur).to(calibrated.dtype)
 
     def _learned_on_cells(self, grid: GridEmbeddings, level: int, cells: torch.Tensor) -> torch.Tensor:
@@ -267,11 +266,6 @@ class PairEnergies:
             return slopes
         log_odds = energies / self.temperature + self.log_share[pairs, None] - math.log(self.flat)
         return slopes * torch.sigmoid(log_odds)
-
-
-def cell_centres(level: int, cells: torch.Tensor) -> torch.Tensor:
-    """Rotations in the middle of cells. (...) int64 -> (..., 3, 3) float64."""
-    return torch.from_numpy(so3_grid.cell_rotations(level, cells.numpy()))
 
 
 def _joined(parts: Sequence[torch.Tensor]) -> torch.Tensor:

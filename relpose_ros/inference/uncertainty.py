@@ -68,28 +68,28 @@ def describe_pairs(
     entropies = -(masses * (masses.clamp_min(1e-300).log() - distributions.log_volumes)).sum(1)
     basins = _basins(distributions, masses)
     weights, by_weight = basins.weights.sort(dim=1, descending=True, stable=True)
-    told = weights >= LEAST_MODE_WEIGHT
-    told[:, 0] = True
-    spreads = np.array([_spread(energies, pair, calibration) for pair in range(energies.count)])
-    cores = _cores(distributions, basins, torch.zeros_like(told).scatter_(1, by_weight, told))
-    cores = np.take_along_axis(cores, by_weight.numpy()[..., None, None], 1) * spreads[:, None, None, None]
+    heavy = weights >= LEAST_MODE_WEIGHT
+    heavy[:, 0] = True
+    widening = np.array([_widening(energies, pair, calibration) for pair in range(energies.count)])
+    cores = _cores(distributions, basins, torch.zeros_like(heavy).scatter_(1, by_weight, heavy))
+    cores = np.take_along_axis(cores, by_weight.numpy()[..., None, None], 1) * widening[:, None, None, None]
     centres = pick(distributions.modes, by_weight)
-    covariances = _second_moments(distributions, centres[:, 0], masses) * spreads[:, None, None]
+    covariances = _second_moments(distributions, centres[:, 0], masses) * widening[:, None, None]
     within = _share(distributions, masses, centres[:, 0])
     agreeing = _share(distributions, masses, solved)
     to_modes = _nearest_modes(distributions, solved[:, None])[0]
     pairs = []
-    for pair, known in enumerate(told.sum(1).tolist()):
+    for pair, count in enumerate(heavy.sum(1).tolist()):
         modes = tuple(
             Mode(camera_j_from_camera_i=centre, weight=weight, covariance=core)
             for centre, weight, core in zip(
-                centres[pair, :known].numpy(),
-                weights[pair, :known].tolist(),
-                cores[pair, :known],
+                centres[pair, :count].numpy(),
+                weights[pair, :count].tolist(),
+                cores[pair, :count],
                 strict=True,
             )
         )
-        ambiguous = known > 1 and modes[1].weight >= RUNNER_UP_WEIGHT
+        ambiguous = count > 1 and modes[1].weight >= RUNNER_UP_WEIGHT
         pairs.append(
             PairRotation(
                 i=int(energies.i[pair]),
@@ -177,8 +177,11 @@ def _nearest_modes(
     return _turned_by(highest), nearest
 
 
-def _spread(energies: PairEnergies, pair: int, calibration: Calibration) -> float:
-    """Fitted where the network speaks alone; the width of a matched peak is fitted by itself."""
+def _widening(energies: PairEnergies, pair: int, calibration: Calibration) -> float:
+    """Factor on a pair's covariances.
+
+    Fitted where the network speaks alone; the width of a matched peak is fitted by itself.
+    """
     return 1.0 if Evidence.GEOMETRIC in _evidence(energies, pair) else calibration.pair_spread
 
 
@@ -208,7 +211,10 @@ def _turned_by(traces: torch.Tensor) -> torch.Tensor:
 
 
 def _inside(angles: torch.Tensor, radius: float, spacings: torch.Tensor) -> torch.Tensor:
-    """Which share of each cell lies within a radius of a rotation, the border taken as flat. (L,) -> (L,)."""
+    """Which share of each cell lies within a radius of a rotation, the border taken as flat.
+
+    (..., L), (L,) -> (..., L).
+    """
     return ((radius - angles) / spacings + 0.5).clamp(0, 1)
 
 
@@ -232,7 +238,9 @@ def _second_moments(
 
 
 def _cores(distributions: PairDistributions, basins: _Basins, told: torch.Tensor) -> FloatArray:
-    """As `_second_moments`, of the cores of some of the modes. (P, M) bool -> (P, M, 3, 3) rad^2, else zero.
+    """As `_second_moments`, of the cores of some of the modes. (P, M) bool -> (P, M, 3, 3) rad^2.
+
+    Of the others, and of one that owns no mass, the least there is.
 
     The further out, the less the mass counts.
 
@@ -240,6 +248,7 @@ def _cores(distributions: PairDistributions, basins: _Basins, told: torch.Tensor
     Gaussian has its own covariance. A few near misses, degrees off, would be most of a second moment, and
     hide how exact the rest is.
     """
+    # Logarithms of the rest would be work for nothing.
     used = basins.owned > 1e-9 * basins.owned.amax(1, keepdim=True)
     pairs, cells = (used & told.gather(1, basins.owners)).nonzero(as_tuple=True)
     # The cells of one mode together.
@@ -261,9 +270,9 @@ def _cores(distributions: PairDistributions, basins: _Basins, told: torch.Tensor
         # At the end the weights sum to one; made so in every round, they get there sooner (Kent et al. 1994).
         weights /= np.add.reduceat(weights, starts)[group]
         scatter = np.add.reduceat(weights[:, None] * squares, starts) + least
-    cores = np.zeros((told.numel(), 9))
-    cores[modes] = scatter / OF_GAUSSIAN
-    return cores.reshape(*told.shape, 3, 3)
+    cores = np.tile(least, (told.numel(), 1))
+    cores[modes] = scatter
+    return cores.reshape(*told.shape, 3, 3) / OF_GAUSSIAN
 
 
 def _least_moment(distributions: PairDistributions) -> FloatArray:
@@ -274,7 +283,7 @@ def _least_moment(distributions: PairDistributions) -> FloatArray:
 def _about(
     distributions: PairDistributions, energies: PairEnergies, relative: torch.Tensor, masses: torch.Tensor
 ) -> torch.Tensor:
-    """The masses (P, L) that tell how exactly pairs hold the poses they are right about.
+    """The masses (P, L) that tell how exactly pairs hold the poses (P, 3, 3) they are right about.
 
     Few chances of a gross error, far away, would be most of a second moment. Where matches agree with the
     poses that chance is told apart, as a probability, and only the mass around the poses counts.

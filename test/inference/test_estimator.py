@@ -110,17 +110,6 @@ def test_same_bits_whatever_was_estimated_before(network):
     )
 
 
-def test_views_looked_at_together_are_those_looked_at_alone(network):
-    together = Estimator(network).features(scan(0, 1, 2, 3, 4))
-    alone = Estimator(network)
-    views = scan(0, 1, 2, 3, 4).views
-    for count in range(2, 5):
-        alone.features(Scan("mug", views[:count]))
-    again = alone.features(Scan("mug", views))
-    assert torch.equal(together.tokens, again.tokens)
-    assert torch.equal(together.maps, again.maps)
-
-
 def test_each_view_is_looked_at_once_and_forgotten_with_the_view(network, monkeypatch):
     looked = []
     monkeypatch.setattr(

@@ -48,3 +48,47 @@ def test_what_goes_wrong_is_told_and_leaves_the_threads_as_they_were():
     with pytest.raises(ValueError, match="not 0"):
         side_by_side(fail, range(3))
     assert torch.get_num_threads() == 3
+
+
+def test_calls_that_overlap_keep_to_one_thread_each():
+    """Torch tells a thread its number when that first asks: here only once another call has come and gone."""
+    running, may_ask = threading.Event(), threading.Event()
+
+    def ask_late(_: int) -> int:
+        running.set()
+        assert may_ask.wait(20)
+        return torch.get_num_threads()
+
+    found = []
+    first = threading.Thread(target=lambda: found.extend(side_by_side(ask_late, range(2))))
+    first.start()
+    assert running.wait(20)
+    assert side_by_side(lambda _: torch.get_num_threads(), range(3)) == [1] * 3
+    may_ask.set()
+    first.join(20)
+    assert found == [1, 1]
+
+
+def test_a_new_thread_that_calls_while_others_work_keeps_its_number():
+    running, done = threading.Event(), threading.Event()
+
+    def work(_: int) -> None:
+        running.set()
+        assert done.wait(20)
+
+    first = threading.Thread(target=lambda: side_by_side(work, range(2)))
+    first.start()
+    assert running.wait(20)
+    numbers = []
+
+    def call() -> None:
+        side_by_side(lambda item: item, range(2))
+        numbers.append(torch.get_num_threads())
+
+    for _ in range(2):
+        caller = threading.Thread(target=call)
+        caller.start()
+        caller.join(20)
+    done.set()
+    first.join(20)
+    assert [*numbers, torch.get_num_threads()] == [3, 3, 3]

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -169,6 +170,18 @@ def test_covariances_are_never_placeholders(fisher_scene_type, seed, views, conc
         assert np.linalg.eigvalsh(covariance[3:, 3:])[0] >= SOLVER_FLOOR**2 * 0.999
         assert not np.allclose(covariance, np.eye(6))
     np.testing.assert_allclose(covariances[0, 3:, 3:], SOLVER_FLOOR**2 * np.eye(3), atol=1e-12)
+
+
+def test_a_mode_that_owns_no_mass_is_not_told_to_be_exact(fisher_scene, cameras_around):
+    scene = fisher_scene(cameras_around(2, 0), concentration=200.0)
+    with torch.no_grad():
+        energies = PairEnergies.of(scene, scene, 2)
+        found = search(energies, GridEmbeddings(scene))
+        away = torch.from_numpy(so3.exp([2.0, 0, 0])) @ found.modes[:, :1]
+        alone = replace(found, modes=away, mode_energies=found.mode_energies[:, :1])
+        (pair,) = describe_pairs(alone, energies, solve(energies, found).rotations[0], UNCALIBRATED)
+    assert pair.modes[0].weight < 1e-9
+    assert np.linalg.eigvalsh(pair.modes[0].covariance)[0] > 1e-6
 
 
 def test_position_and_rotation_covary_as_a_camera_on_a_lever(fisher_scene, cameras_around):
