@@ -36,9 +36,8 @@ def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> l
     waiting = list(items)
     if not waiting:
         return []
-    with (
-        _STARTING
-    ):  # not while others start theirs: a thread takes over the process's number when it first asks
+    # Not while others start theirs: a thread takes over the process's number when it first asks for it.
+    with _STARTING:
         threads = torch.get_num_threads()
     count = min(threads, len(waiting))
     started = threading.Barrier(count + 1, timeout=START_TIMEOUT)
