@@ -91,7 +91,7 @@ def ways(network: RelPose) -> dict[str, Callable[[], Lowered]]:
         for module in lowered.modules():
             if isinstance(module, nn.Linear | nn.Conv2d):
                 flat = module.weight.flatten(1)
-                step = flat.abs().amax(1, keepdim=True) / 127
+                step = flat.abs().amax(1, keepdim=True).clamp_min(1e-30) / 127  # a row may be all zeros
                 module.weight.copy_(((flat / step).round() * step).reshape(module.weight.shape))
         return Lowered(lowered)
 
