@@ -2,6 +2,9 @@
 
     python -m benchmarks.encoder [--threads 2] [--presets paper compact]
 
+Views are looked at one after another, on all threads; the estimator gives each view of the compact network a
+thread of its own, and what that takes `benchmarks/solver.py` tells.
+
 Each preset runs in a process of its own, whose peak memory is then that of the largest N so far.
 """
 
@@ -59,7 +62,7 @@ def rows(name: str, repeats: int) -> None:
     for count in tqdm(range(MIN_VIEWS, MAX_VIEWS + 1), desc=name, leave=False):
 
         def look(view: int) -> ViewFeatures:
-            # One at a time, as the estimator does: a view's features must not depend on its company.
+            # One at a time: a view's features must not depend on its company.
             return network.look(images[view : view + 1])[0]
 
         def first(count: int = count) -> object:

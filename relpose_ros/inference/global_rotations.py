@@ -347,8 +347,7 @@ def _jumped(
     if not restless.any():
         return rotations
     moving, now = moving.only(restless), now[restless]
-    level = distributions.coarse_level
-    cells = so3_grid.centres(level, torch.arange(so3_grid.size(level)))
+    cells = torch.tensor(so3_grid.grid(distributions.coarse_level))
     modes = moving.where_modes_put(distributions.modes)
     places = torch.cat([modes, cells.expand(*modes.shape[:2], -1, -1, -1)], 2)
     guesses = moving.remembered(distributions, places)

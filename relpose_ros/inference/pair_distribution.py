@@ -150,8 +150,7 @@ def highest_apart(
         Positions (P, <= M) int64, highest first, and values (P, <= M), -inf where a row has no more.
     """
     least_trace = 1 + 2 * math.cos(separation)
-    # (P, N, L, 9): the trace of A B^T is their scalar product.
-    flat = rotations.reshape(*values.shape, -1, 9).transpose(1, 2).contiguous()
+    flat = rotations.reshape(*values.shape, -1, 9)  # the trace of A B^T is their scalar product
     left = values.clone()
     rows = torch.arange(len(flat))
     tops, heights = [], []
@@ -159,8 +158,8 @@ def highest_apart(
         best = left.argmax(1)
         tops.append(best)
         heights.append(left[rows, best])
-        traces = (flat @ flat[rows, :, best][..., None])[..., 0].amin(1)
-        left.masked_fill_(traces > least_trace, -math.inf)
+        traces = torch.einsum("plna,pna->pln", flat, flat[rows, best]).amin(2)
+        left = left.masked_fill(traces > least_trace, -math.inf)
         left[rows, best] = -math.inf
     return torch.stack(tops, 1), torch.stack(heights, 1)
 

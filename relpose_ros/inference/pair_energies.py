@@ -86,7 +86,7 @@ class GridEmbeddings:
     def __call__(self, level: int) -> torch.Tensor:
         """(72 * 8^level, H) embeddings of a whole level."""
         if level not in self._levels:
-            rotations = so3_grid.centres(level, torch.arange(so3_grid.size(level)))
+            rotations = torch.tensor(so3_grid.grid(level))
             parts = [self._head.embed(part) for part in torch.split(rotations, ROWS)]
             self._levels[level] = torch.cat(parts)
         return self._levels[level]

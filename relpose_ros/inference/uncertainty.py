@@ -70,7 +70,9 @@ def describe_pairs(
     weights, by_weight = basins.weights.sort(dim=1, descending=True, stable=True)
     heavy = weights >= LEAST_MODE_WEIGHT
     heavy[:, 0] = True
-    widening = np.array([_widening(energies, pair, calibration) for pair in range(energies.count)])
+    evidence = [_evidence(energies, pair) for pair in range(energies.count)]
+    # Fitted where the network speaks alone; the width of a matched peak is fitted by itself.
+    widening = np.array([1.0 if Evidence.GEOMETRIC in each else calibration.pair_spread for each in evidence])
     cores = _cores(distributions, basins, torch.zeros_like(heavy).scatter_(1, by_weight, heavy))
     cores = np.take_along_axis(cores, by_weight.numpy()[..., None, None], 1) * widening[:, None, None, None]
     centres = pick(distributions.modes, by_weight)
@@ -103,7 +105,7 @@ def describe_pairs(
                 ambiguity_angle=_angle(modes[0], modes[1]) if ambiguous else 0.0,
                 solution_probability=float(agreeing[pair]),
                 solution_angle=float(to_modes[pair, 0]),
-                evidence=_evidence(energies, pair),
+                evidence=evidence[pair],
             )
         )
     return tuple(pairs)
@@ -175,14 +177,6 @@ def _nearest_modes(
     traces = _traces(rotations, distributions.modes).masked_fill(lacking[:, None], -math.inf)
     highest, nearest = traces.max(2)
     return _turned_by(highest), nearest
-
-
-def _widening(energies: PairEnergies, pair: int, calibration: Calibration) -> float:
-    """Factor on a pair's covariances.
-
-    Fitted where the network speaks alone; the width of a matched peak is fitted by itself.
-    """
-    return 1.0 if Evidence.GEOMETRIC in _evidence(energies, pair) else calibration.pair_spread
 
 
 def _evidence(energies: PairEnergies, pair: int) -> Evidence:

@@ -93,7 +93,9 @@ def test_first_axes_are_the_healpix_centres_of_the_ring_formulas(level: int) -> 
 
 
 def test_single_cells_are_those_of_the_whole_level() -> None:
-    level = so3_grid.LAST_TABULATED + 1  # those before it are looked up in the whole level
+    cells = np.array([0, 71, 72 * 8 - 1, 300])
+    assert np.array_equal(so3_grid.cell_rotations(1, cells), so3_grid.grid(1)[cells])
+    level = so3_grid.LAST_TABULATED + 1  # up to that one they are looked up in the whole level
     cells = np.array([[0, 71], [72 * 8**level - 1, 300]])
     assert np.array_equal(so3_grid.cell_rotations(level, cells), so3_grid.grid(level)[cells])
     assert so3_grid.cell_rotations(6, [72 * 8**6 - 1]).shape == (1, 3, 3)

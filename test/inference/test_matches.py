@@ -231,6 +231,7 @@ def support(inliers=30, residual=0.45, spread=0.8):
 
 def test_trust_grows_with_what_speaks_for_a_pose():
     assert trust(support(100)) > trust(support(50)) > trust(support(25)) > 0.5
+    assert 0 < trust(support(LEAST_MATCHES)) < trust(support(25))
     assert 0 < trust(support(LEAST_MATCHES - 1)) < 0.5
     assert trust(support(10_000)) < 1
     assert trust(support(residual=0.3)) > trust(support(residual=0.7))
