@@ -313,6 +313,14 @@ def _parser() -> argparse.ArgumentParser:
         help="processes beside it that prepare batches (default: 0)",
     )
     train.add_argument(
+        "--backbone-rate",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="train the pretrained backbone of 'compact' too, behind the first features that are kept of it, "
+        "at this share of the learning rate (default: 0, it stays as it is)",
+    )
+    train.add_argument(
         "--start-from",
         type=_home_path,
         metavar="FILE",
@@ -578,6 +586,7 @@ def _train(arguments: argparse.Namespace) -> int:
         settings = replace(settings, images=arguments.images)
     if arguments.precision:
         settings = replace(settings, precision=arguments.precision)
+    settings = replace(settings, backbone_rate=arguments.backbone_rate)
     held_out = open_scans(arguments.held_out) if arguments.held_out else None
     scans = open_scans(arguments.scans)
     trainer = Trainer(

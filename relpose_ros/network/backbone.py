@@ -99,11 +99,16 @@ class Backbone(nn.Sequential):
 
     def stage_maps(self, images: torch.Tensor) -> list[torch.Tensor]:
         """The map that leaves each stage. (B, 3, S, S) -> [(B, C_k, S / 2^(k+2), S / 2^(k+2))]."""
-        stem = len(self) - len(self.widths)
         x = images.contiguous(memory_format=torch.channels_last)
-        maps = []
-        for position, layer in enumerate(self):
+        for layer in list(self)[: len(self) - len(self.widths)]:
             x = layer(x)
-            if position >= stem:
-                maps.append(x)
+        return self.later_maps(x, -1)
+
+    def later_maps(self, feature_map: torch.Tensor, k: int) -> list[torch.Tensor]:
+        """Map k of `stage_maps`, or -1 for what leaves the stem -> those behind it."""
+        x = feature_map.contiguous(memory_format=torch.channels_last)
+        maps = []
+        for stage in list(self)[len(self) - len(self.widths) + k + 1 :]:
+            x = stage(x)
+            maps.append(x)
         return maps

@@ -84,9 +84,28 @@ class EfficientNetLite0(nn.Module):
     def stage_maps(self, images: torch.Tensor) -> list[torch.Tensor]:
         """(B, 3, S, S) -> [(B, C_k, S / 2^(k+2), S / 2^(k+2))] for k = 0 to 3."""
         x = functional.relu6(self.stem(images.contiguous(memory_format=torch.channels_last)), inplace=True)
+        return self._maps_from(0, x)
+
+    def later_maps(self, feature_map: torch.Tensor, k: int) -> list[torch.Tensor]:
+        """Map k of `stage_maps` -> those behind it."""
+        x = feature_map.contiguous(memory_format=torch.channels_last)
+        return self._maps_from(_LAST_OF_RESOLUTION[k] + 1, x)
+
+    def pointwise_behind(self, k: int) -> list[nn.Parameter]:
+        """Weights and biases of the 1x1 convolutions behind map k: nearly all the weights there are."""
+        return [
+            parameter
+            for stage in list(self.stages)[_LAST_OF_RESOLUTION[k] + 1 :]
+            for module in stage.modules()
+            if isinstance(module, nn.Conv2d) and module.groups == 1
+            for parameter in module.parameters()
+        ]
+
+    def _maps_from(self, first: int, x: torch.Tensor) -> list[torch.Tensor]:
         maps = []
         for position, stage in enumerate(self.stages):
-            x = stage(x)
-            if position in _LAST_OF_RESOLUTION:
-                maps.append(x)
+            if position >= first:
+                x = stage(x)
+                if position in _LAST_OF_RESOLUTION:
+                    maps.append(x)
         return maps

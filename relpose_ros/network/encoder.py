@@ -205,7 +205,14 @@ class Encoder(nn.Module):
         return self.summarise(self.feature_extractor.stage_maps(images))
 
     def summarise(self, maps: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """`look` from the maps of the backbone's stages on; those before the descriptors' are not read."""
+        """`look` from the maps of the backbone's stages on.
+
+        Those before the descriptors' are not read; where the last ones are missing, the backbone goes on from
+        the last one given.
+        """
+        given, last = len(maps), maps[-1]
+        assert last is not None
+        maps = [*maps, *self.feature_extractor.later_maps(last, given - 1)]
         last = maps[-1]
         assert last is not None
         pooled = last.mean((-2, -1)) if self.layout is None else self.layout(last)

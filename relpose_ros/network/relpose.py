@@ -97,12 +97,16 @@ class RelPose(nn.Module):
         """`look` from the maps of the backbone's stages on, for who has kept those of a frozen backbone.
 
         Args:
-            maps: (..., N, C_k, S / 2^(k+2), S / 2^(k+2)) of stage k; None where nothing is read of it.
+            maps: (..., N, C_k, S / 2^(k+2), S / 2^(k+2)) of stage k; None where nothing is read of it. Those
+                of the last stages may be missing: the backbone goes on from the last one given.
 
         Raises:
             NetworkUseError: A map that is read has another shape.
         """
-        for stage, shape in self.feature_extractor.summarised_shapes.items():
+        shapes = self.feature_extractor.summarised_shapes
+        for stage, shape in shapes.items():
+            if stage >= len(maps) > min(shapes):
+                break
             given = maps[stage] if stage < len(maps) else None
             if given is None or given.shape[-3:] != shape:
                 has = "none" if given is None else f"one of shape {tuple(given.shape)}"

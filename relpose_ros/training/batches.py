@@ -86,6 +86,11 @@ class Scans:
         """Views that every scan has at least."""
         return min(int(shard["places"].shape[1]) for shard in self._shards)
 
+    def first_maps(self) -> Scans:
+        """The same scans with the first of their maps alone, for a backbone that is trained from there on."""
+        later = {MAP.format(stage) for stage in self.map_shapes if stage > min(self.map_shapes)}
+        return Scans([{name: shard[name] for name in shard if name not in later} for shard in self._shards])
+
     def row(self, index: int) -> dict[str, npt.NDArray[Any]]:
         """One scan: its images or maps and the arrays of `FIELDS`, without copying them."""
         shard = int(np.searchsorted(self._ends, index, side="right"))

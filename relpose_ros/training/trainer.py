@@ -26,6 +26,7 @@ from torch.utils.data import DataLoader, Dataset
 from relpose_ros.errors import RelPoseError
 from relpose_ros.geometry import so3, so3_grid
 from relpose_ros.network.checkpoint import load_network, random_network, read_metadata, write_network
+from relpose_ros.network.efficientnet import EfficientNetLite0
 from relpose_ros.network.presets import Preset, named_preset
 from relpose_ros.training.batches import Augmentation, Scans, make_batch
 from relpose_ros.training.imagenet import imagenet_backbone
@@ -91,6 +92,9 @@ class TrainingSettings:
     curriculum: tuple[tuple[float, float], ...] = ((0.0, 45.0), (0.25, 90.0), (0.5, 180.0))
     """(share of the run, degrees): views of a scan lie within an angle of one of them, which is drawn
     for each step between the first of these and the one that the run has come to."""
+    backbone_rate: float = 0.0
+    """Learning rate of a pretrained backbone as a share of the others'; 0 leaves it as it is. Its pointwise
+    convolutions learn, behind the first map that is read: on CPUs the others would take twice the time."""
     precision: str = "bfloat16"
     """Of the forward pass: float32, bfloat16, or float16 (GPU)."""
     objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
@@ -103,8 +107,8 @@ class TrainingSettings:
         return named_preset(self.preset, self.variants)
 
     @property
-    def frozen_backbone(self) -> bool:
-        """Whether the backbone has the weights of `relpose_ros.training.imagenet` and keeps them."""
+    def pretrained_backbone(self) -> bool:
+        """Whether the backbone begins with the weights of `relpose_ros.training.imagenet`."""
         return self.network.backbone == "efficientnet_lite0"
 
 
@@ -147,7 +151,7 @@ def initial_network(settings: TrainingSettings) -> RelPose:
         PretrainedError: Those are not installed.
     """
     network = random_network(settings.network, settings.seed)
-    if settings.frozen_backbone:
+    if settings.pretrained_backbone:
         network.feature_extractor.feature_extractor.load_state_dict(imagenet_backbone().state_dict())
     return network
 
@@ -189,7 +193,6 @@ class Trainer:
         """
         self.settings = settings
         self.folder = folder
-        self._scans, self._held_out = scans, held_out
         self._workers = workers
         self._batches: Iterator[tuple[Batch, Targets]] | None = None
         self._device = _own_device(device)
@@ -199,17 +202,26 @@ class Trainer:
         network = random_network(settings.network, settings.seed) if goes_on else initial_network(settings)
         self.network = network.to(self._device).train()
         self.average = copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
-        if settings.frozen_backbone:
+        if settings.pretrained_backbone:
             network.feature_extractor.feature_extractor.requires_grad_(requires_grad=False)
         self._check_fit(scans, held_out)
         trained = [p for p in self.network.parameters() if p.requires_grad]
         decayed = [p for p in trained if p.ndim > 1]
         plain = [p for p in trained if p.ndim <= 1]
+        groups: list[tuple[list[torch.nn.Parameter], float, float]] = [
+            (decayed, settings.weight_decay, 1.0),
+            (plain, 0.0, 1.0),
+        ]
+        if backbone := self._trained_backbone():
+            groups.append((backbone, 0.0, settings.backbone_rate))
+            if scans.map_shapes:
+                scans = scans.first_maps()
+            if held_out is not None and held_out.map_shapes:
+                held_out = held_out.first_maps()
+        self._scans, self._held_out = scans, held_out
+        self._rate_shares = [share for _, _, share in groups]
         self._optimizer = torch.optim.AdamW(
-            [
-                {"params": decayed, "weight_decay": settings.weight_decay},
-                {"params": plain, "weight_decay": 0.0},
-            ],
+            [{"params": parameters, "weight_decay": decay} for parameters, decay, _ in groups],
             lr=settings.learning_rate,
             betas=(0.9, 0.98),  # a longer memory of squared gradients let early steps run away
         )
@@ -283,8 +295,8 @@ class Trainer:
         """One update. -> (4,) total loss, rotation, translation, matches."""
         settings = self.settings
         rate = self.learning_rate()
-        for group in self._optimizer.param_groups:
-            group["lr"] = rate
+        for group, share in zip(self._optimizer.param_groups, self._rate_shares, strict=True):
+            group["lr"] = rate * share
         batch, targets = self._next_batch()
         losses = self._losses(batch, targets)
         self._optimizer.zero_grad()
@@ -362,6 +374,13 @@ class Trainer:
                 "name another folder."
             )
             raise TrainingError(text)
+        if len(state["optimizer"]["param_groups"]) != len(self._rate_shares):
+            text = (
+                f"the checkpoint in {self.folder} is of a run whose backbone was"
+                f"{' not' if self.settings.backbone_rate else ''} trained; "
+                "name another folder, and its weights to start from."
+            )
+            raise TrainingError(text)
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
         self._optimizer.load_state_dict(state["optimizer"])
@@ -378,11 +397,19 @@ class Trainer:
             text = f"{weights} holds another network than {self._asked()}; name its preset and variants."
             raise TrainingError(text)
         state = begun.state_dict()
-        if self.settings.frozen_backbone:
-            # In the full precision in which it looks, where the file has half of it.
-            state |= {
+        if self.settings.pretrained_backbone:
+            own = {
                 name: value for name, value in self.network.state_dict().items() if name.startswith(_BACKBONE)
             }
+            # In the full precision in which it looks, where the file has half of it.
+            same = {name: value for name, value in own.items() if value.half().equal(state[name].half())}
+            if len(same) < len(own) and self._scans.map_shapes and not self.settings.backbone_rate:
+                text = (
+                    f"the backbone of {weights} was trained, and the shards hold what it saw before; "
+                    "train it further, or give it shards of images."
+                )
+                raise TrainingError(text)
+            state |= same
         for network in (self.network, self.average):
             network.load_state_dict(state)
         self.images = self._began = int(read_metadata(weights).get("images_seen", "0"))
@@ -391,13 +418,28 @@ class Trainer:
         """Refuse maps of a backbone that this network does not read, or would train on."""
         shapes = self.network.feature_extractor.summarised_shapes
         for each in (scans, *([] if held_out is None else [held_out])):
-            if each.map_shapes and not (self.settings.frozen_backbone and each.map_shapes == shapes):
+            if each.map_shapes and not (self.settings.pretrained_backbone and each.map_shapes == shapes):
                 side = self.settings.network.image_size
                 text = (
                     f"the shards hold features of another backbone than that of {self._asked()}, or of "
                     f"images not {side} pixels wide; give it shards of images."
                 )
                 raise TrainingError(text)
+
+    def _trained_backbone(self) -> list[torch.nn.Parameter]:
+        """What is trained of a pretrained backbone."""
+        if self.settings.backbone_rate == 0:
+            return []
+        encoder = self.network.feature_extractor
+        backbone = encoder.feature_extractor
+        first = min(encoder.summarised_shapes)
+        trained = backbone.pointwise_behind(first) if isinstance(backbone, EfficientNetLite0) else []
+        if not trained:
+            text = f"{self._asked()} has no pretrained layers behind what it reads; name no rate for them."
+            raise TrainingError(text)
+        for each in trained:
+            each.requires_grad = True
+        return trained
 
     def _asked(self) -> str:
         return "'" + " + ".join([self.settings.preset, *self.settings.variants]) + "'"

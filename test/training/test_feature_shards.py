@@ -134,7 +134,7 @@ def test_copies_are_what_the_changed_images_show(shards, frozen, tmp_path):
     assert sizes <= {(640, 480), (480, 640)}
 
 
-def test_a_frozen_backbone_stays_as_it_was(shards, frozen, tmp_path):
+def test_a_pretrained_backbone_stays_as_it_was(shards, frozen, tmp_path):
     public = trainer.imagenet_backbone().state_dict()
     write_feature_shards(tmp_path / "features", [shards], trainer.initial_network(frozen), 1)
     features = open_scans([tmp_path / "features"])
@@ -159,6 +159,73 @@ def test_a_frozen_backbone_stays_as_it_was(shards, frozen, tmp_path):
     again.train_step()
 
 
+def test_a_pretrained_backbone_can_be_trained_from_its_first_map_on(shards, frozen, tmp_path):
+    public = trainer.imagenet_backbone().state_dict()
+    write_feature_shards(tmp_path / "features", [shards], trainer.initial_network(frozen), 1)
+    features = open_scans([tmp_path / "features"])
+    settings = replace(frozen, backbone_rate=0.25, warmup_images=0, decay=0.0)
+    run = Trainer(settings, tmp_path / "run", features, features)
+    before = {name: value.clone() for name, value in run.network.state_dict().items()}
+    run.train_step()
+    backbone = "feature_extractor.feature_extractor."
+    steps = {name: (value - before[name]).abs().max() for name, value in run.network.state_dict().items()}
+    own = {name.removeprefix(backbone): step for name, step in steps.items() if name.startswith(backbone)}
+    # Map 1 leaves stage 2: before it, and between channels of their own, nothing moves.
+    moved = {name for name, step in own.items() if step > 0}
+    behind = tuple(f"stages.{stage}." for stage in range(3, 7))
+    assert moved <= {name for name in own if name.startswith(behind) and "depthwise" not in name}
+    assert {"stages.3.0.expand.weight", "stages.6.0.project.weight", "stages.6.0.project.bias"} <= moved
+    # The first step of Adam is as long as the learning rate.
+    assert max(own.values()) == pytest.approx(0.25 * settings.learning_rate, rel=1e-2)
+    assert steps["feature_extractor.descriptors.mix.weight"] == pytest.approx(
+        settings.learning_rate, rel=2e-2
+    )
+    assert run.measure(views=2, count=2)["pair_median"] >= 0
+    run.save()
+
+    again = Trainer(settings, tmp_path / "run", features)
+    for one, other in zip(again.network.parameters(), run.network.parameters(), strict=True):
+        assert one.equal(other)
+    again.train_step()
+    # Weights that begin another run keep what was trained, and the rest in full precision.
+    half = tmp_path / "half.safetensors"
+    write_network(run.network, half, {"images_seen": "5"}, half=True)
+    begun = Trainer(settings, tmp_path / "begun", features, start_from=half).network.state_dict()
+    for name in own:
+        stored = run.network.state_dict()[backbone + name].half().float()
+        assert begun[backbone + name].equal(stored if name in moved else public[name])
+
+
+def test_maps_behind_the_first_are_worked_out_where_they_are_missing(shards, frozen):
+    network = trainer.initial_network(frozen)
+    images = normalised(read_shard(shards / "00000")["images"][0])
+    maps = network.feature_extractor.feature_extractor.stage_maps(images)
+    with torch.no_grad():
+        seen, given = network.look(images), network.summarise([None, maps[1]])
+    torch.testing.assert_close(given.pooled, seen.pooled)
+    torch.testing.assert_close(given.maps, seen.maps)
+    with pytest.raises(NetworkUseError, match=r"maps \(112, 2, 2\) of stage 2; it was given none"):
+        network.summarise([None, maps[1], None])
+
+
+def test_where_a_backbone_was_trained_is_not_forgotten(shards, frozen, tiny_preset, tmp_path, monkeypatch):
+    write_feature_shards(tmp_path / "features", [shards], trainer.initial_network(frozen), 1)
+    features = open_scans([tmp_path / "features"])
+    settings = replace(frozen, backbone_rate=0.5)
+    run = Trainer(settings, tmp_path / "run", features)
+    run.train_step()
+    run.save()
+    weights = tmp_path / "run" / "weights.safetensors"
+    with pytest.raises(TrainingError, match=r"is of a run whose backbone was trained; name another folder"):
+        Trainer(frozen, tmp_path / "run", features)
+    with pytest.raises(TrainingError, match="was trained, and the shards hold what it saw before"):
+        Trainer(frozen, tmp_path / "begun", features, start_from=weights)
+    assert Trainer(frozen, tmp_path / "begun", open_scans([shards]), start_from=weights).images == run.images
+    monkeypatch.setitem(PRESETS, "tiny", tiny_preset)
+    with pytest.raises(TrainingError, match="'tiny' has no pretrained layers behind what it reads"):
+        Trainer(settings, tmp_path / "residual", open_scans([shards]))
+
+
 def test_features_of_another_backbone_are_refused(shards, frozen, tiny_preset, tmp_path, monkeypatch):
     write_feature_shards(tmp_path / "features", [shards], trainer.initial_network(frozen), 1)
     features = open_scans([tmp_path / "features"])
@@ -174,6 +241,6 @@ def test_features_of_another_backbone_are_refused(shards, frozen, tiny_preset, t
         own.summarise([None, None])
 
 
-def test_compact_has_a_frozen_backbone_and_the_paper_has_not():
-    assert trainer.settings_for("compact").frozen_backbone
-    assert not trainer.settings_for("paper").frozen_backbone
+def test_compact_has_a_pretrained_backbone_and_the_paper_has_not():
+    assert trainer.settings_for("compact").pretrained_backbone
+    assert not trainer.settings_for("paper").pretrained_backbone
