@@ -137,6 +137,8 @@ class Estimator:
             evidence: what else to rest on.
         """
         self._network = network.eval()
+        # In the views' order of memory: a convolution would rearrange its weights at every view.
+        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._regresses = network.preset.rotation == "regression"
         self._calibration = None if self._regresses else calibration
         self._evidence = evidence

@@ -68,10 +68,12 @@ class Bottleneck(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """(B, inside, h, w) -> (B, outside, h, w), or half of h and w."""
-        residual = functional.relu(self.bn1(self.conv1(x)))
-        residual = functional.relu(self.bn2(self.conv2(residual)))
+        # In place: no norm's derivatives need what it gave.
+        residual = functional.relu(self.bn1(self.conv1(x)), inplace=True)
+        residual = functional.relu(self.bn2(self.conv2(residual)), inplace=True)
         residual = self.bn3(self.conv3(residual))
-        return functional.relu(residual + (x if self.downsample is None else self.downsample(x)))
+        shortcut = x if self.downsample is None else self.downsample(x)
+        return functional.relu(residual.add_(shortcut), inplace=True)
 
 
 class Backbone(nn.Sequential):
@@ -80,7 +82,12 @@ class Backbone(nn.Sequential):
     def __init__(self, preset: Preset) -> None:
         inside = preset.stem_width
         pool = nn.Sequential(nn.MaxPool2d(2, stride=1), Blur(inside))
-        stem = [nn.Conv2d(3, inside, 7, stride=2, padding=3, bias=False), group_norm(inside), nn.ReLU(), pool]
+        stem = [
+            nn.Conv2d(3, inside, 7, stride=2, padding=3, bias=False),
+            group_norm(inside),
+            nn.ReLU(inplace=True),
+            pool,
+        ]
         stages = []
         self.widths = []
         for stage, (width, depth) in enumerate(zip(preset.stage_widths, preset.stage_depths, strict=True)):
