@@ -18,6 +18,7 @@ import numpy as np
 
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import homogeneous
+from relpose_ros.inference.groups import groups
 from relpose_ros.inference.uncertainty import SURE
 
 if TYPE_CHECKING:
@@ -216,7 +217,7 @@ def _connected(seen: _Observations, cameras: int) -> _Observations | None:
     while True:
         if len(seen.camera) == 0:
             return None
-        group = _groups(seen.camera, cameras + seen.point, cameras + int(seen.point.max()) + 1)
+        group = groups(seen.camera, cameras + seen.point, cameras + int(seen.point.max()) + 1)
         largest = np.bincount(group[seen.camera]).argmax()
         counts = np.bincount(seen.camera, minlength=cameras)
         keep = (group[seen.camera] == largest) & (counts[seen.camera] >= LEAST_OBSERVATIONS)
@@ -225,15 +226,6 @@ def _connected(seen: _Observations, cameras: int) -> _Observations | None:
         seen = seen.chosen(_repeated(seen, keep))
     points, members = int(seen.point.max()) + 1, np.unique(seen.camera)
     return seen if points >= LEAST_POINTS and len(members) >= 2 else None
-
-
-def _groups(ends: IntArray, others: IntArray, count: int) -> IntArray:
-    """Of each of some nodes the number of its group, those of nodes tied to each other. -> (count,)."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_matrix((np.ones(len(ends)), (ends, others)), (count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
 def _held_together(
@@ -246,7 +238,7 @@ def _held_together(
         if i in members and j in members and geometry.chance_of(rotations[j] @ rotations[i].T) >= SURE
     ]
     ends = np.array(sure, np.int64).reshape(-1, 2)
-    group = _groups(ends[:, 0], ends[:, 1], len(rotations))[members]
+    group = groups(ends[:, 0], ends[:, 1], len(rotations))[members]
     return tuple(tuple(members[group == each].tolist()) for each in dict.fromkeys(group.tolist()))
 
 

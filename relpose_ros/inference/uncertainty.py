@@ -12,6 +12,7 @@ import torch
 
 from relpose_ros.estimates import Evidence, Mode, PairRotation
 from relpose_ros.geometry import so3
+from relpose_ros.inference.groups import groups
 from relpose_ros.inference.pair_distribution import pick
 from relpose_ros.inference.rotation_evidence import FREEDOM
 
@@ -276,18 +277,35 @@ def _least_moment(distributions: PairDistributions) -> FloatArray:
 
 def _about(
     distributions: PairDistributions, energies: PairEnergies, relative: torch.Tensor, masses: torch.Tensor
-) -> torch.Tensor:
+) -> tuple[torch.Tensor, torch.Tensor]:
     """The masses (P, L) that tell how exactly pairs hold the poses (P, 3, 3) they are right about.
 
     Few chances of a gross error, far away, would be most of a second moment. Where matches agree with the
-    poses that chance is told apart, as a probability, and only the mass around the poses counts.
+    poses that chance is told apart, as a probability, and only the mass around the poses counts. Which pairs
+    those are comes second, (P,).
     """
     if energies.evidence is None:
-        return masses
+        return masses, torch.zeros(energies.count, dtype=torch.bool)
     angles = _angles(distributions.rotations, relative)
     near = _inside(angles, BASIN, distributions.spacings) * masses
     sure = torch.tensor(energies.evidence.spoken) & (near.sum(1) >= SURE)
-    return torch.where(sure[:, None], near, masses)
+    return torch.where(sure[:, None], near, masses), sure
+
+
+def _independence(energies: PairEnergies, sure: torch.Tensor) -> FloatArray:
+    """Which part of each pair's information counts, (P,), in the sum over a scan.
+
+    Every view takes part in N - 1 pairs, whose errors are therefore not N - 1 independent ones: the sum is
+    divided by N / 2, which is exact where each view has one error of its own. Views that sure pairs tie
+    together see the same side: what the network mistakes in one it mistakes in the others. Between two such
+    groups the mean of the pairs counts, as if each group were one view.
+    """
+    i, j = energies.i.numpy(), energies.j.numpy()
+    tied = sure.numpy()
+    group = groups(i[tied], j[tied], energies.views)
+    sizes = np.bincount(group)
+    within = group[i] == group[j]
+    return np.where(within, 2 / energies.views, 2 / len(sizes) / (sizes[group[i]] * sizes[group[j]]))
 
 
 def _turns(rotations: torch.Tensor) -> torch.Tensor:
@@ -382,9 +400,7 @@ def _joint_spread(
 ) -> FloatArray:
     """Covariance of each camera's turn in its own axes, the first camera held. -> (N, 3, 3) rad^2.
 
-    With R_ij = R_j R_i^T, turns e_i and e_j of the cameras turn R_ij by e_j - R_ij e_i. Every view takes part
-    in N - 1 pairs, whose errors are therefore not N - 1 independent ones: the sum of the pairs' information
-    is divided by N / 2, which is exact where each view has one error of its own.
+    With R_ij = R_j R_i^T, turns e_i and e_j of the cameras turn R_ij by e_j - R_ij e_i.
 
     A pair that may have any rotation has a covariance too, that of the uniform distribution. That much is
     taken off what each pair tells, and given back to each camera once, as the mean of its pairs: however many
@@ -394,12 +410,13 @@ def _joint_spread(
     masses = distributions.masses(calibration.temperature, calibration.flat)
     information = UNTIED * np.eye(3 * energies.views)
     given_back = np.zeros((energies.views, 3, 3))
-    about = _about(distributions, energies, relative, masses)
+    about, sure = _about(distributions, energies, relative, masses)
     moments = _second_moments(distributions, relative, about)
+    shares = _independence(energies, sure)
     for pair, (i, j) in enumerate(zip(energies.i.tolist(), energies.j.tolist(), strict=True)):
         variances, axes = np.linalg.eigh(moments[pair])
         nothing = axes / np.maximum(variances, UNIFORM_VARIANCE) @ axes.T
-        told = axes / variances @ axes.T - nothing
+        told = shares[pair] * (axes / variances @ axes.T - nothing)
         turned = relative[pair].numpy()
         given_back[i] += turned.T @ nothing @ turned / (energies.views - 1)
         given_back[j] += nothing / (energies.views - 1)
@@ -407,7 +424,7 @@ def _joint_spread(
         jacobian[:, 3 * i : 3 * i + 3] = -turned
         jacobian[:, 3 * j : 3 * j + 3] = np.eye(3)
         information += jacobian.T @ told @ jacobian
-    joint = np.linalg.inv(information[3:, 3:] / (energies.views / 2))
+    joint = np.linalg.inv(information[3:, 3:])
     spread = np.zeros((energies.views, 3, 3))
     for camera in range(1, energies.views):
         own = joint[3 * camera - 3 : 3 * camera, 3 * camera - 3 : 3 * camera]

@@ -16,6 +16,7 @@ from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.global_rotations import solve
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import GridEmbeddings, PairEnergies
+from relpose_ros.inference.rotation_evidence import Peak, RotationEvidence
 from relpose_ros.inference.uncertainty import (
     SOLVER_FLOOR,
     _turns,
@@ -150,6 +151,29 @@ def test_pairs_that_say_nothing_say_no_more_together(fisher_scene, cameras_aroun
         _, covariances, _ = told(scene)
         for covariance in covariances[1:]:
             np.testing.assert_allclose(covariance[3:, 3:], UNIFORM_VARIANCE * np.eye(3), rtol=0.15, atol=0.1)
+
+
+def test_two_groups_tied_by_matches_know_each_other_as_one_pair_would(fisher_scene, cameras_around):
+    """Six pairs between them, all with the same mistake to make, hold no better than one does.
+
+    Nor do they where nothing ties the views, and each has an error of its own.
+    """
+    scene = fisher_scene(cameras_around(5, 7), concentration=1.5)
+    peaks = [
+        [Peak(scene.relative(i, j), 1e-4 * np.eye(3), 0.99)] if (i < 2) == (j < 2) else []
+        for i, j in itertools.combinations(range(5), 2)
+    ]
+    translations = np.tile([0.0, 0.0, 1.0], (5, 1))
+    for evidence in (RotationEvidence(peaks), None):
+        energies = PairEnergies.of(scene, scene, 5, evidence=evidence)
+        distributions = search(energies, GridEmbeddings(scene))
+        solution = torch.from_numpy(scene.cameras)
+        pairs = describe_pairs(distributions, energies, solution, UNCALIBRATED)
+        covariances = camera_covariances(distributions, energies, solution, translations, UNCALIBRATED)
+        variances = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2) / 3
+        across = np.mean([np.trace(pair.covariance) / 3 for pair in pairs if pair.i < 2 <= pair.j])
+        np.testing.assert_allclose(variances[2:], across, rtol=0.1)
+        assert variances[1] < 0.01 if evidence else variances[1] == pytest.approx(across, rel=0.1)
 
 
 @given(
