@@ -406,7 +406,7 @@ class Trainer:
             if len(same) < len(own) and self._scans.map_shapes and not self.settings.backbone_rate:
                 text = (
                     f"the backbone of {weights} was trained, and the shards hold what it saw before; "
-                    "train it further, or give it shards of images."
+                    "train it further (--backbone-rate), or give it shards of images."
                 )
                 raise TrainingError(text)
             state |= same
