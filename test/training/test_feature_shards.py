@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from relpose_ros import cli
 from relpose_ros.captures.shards import new_shard, read_shard
-from relpose_ros.network.checkpoint import random_network, write_network
+from relpose_ros.network.checkpoint import load_network, random_network, write_network
 from relpose_ros.network.efficientnet import EfficientNetLite0
 from relpose_ros.network.presets import PRESETS
 from relpose_ros.network.relpose import NetworkUseError
@@ -24,6 +25,7 @@ from relpose_ros.training.batches import (
     open_scans,
 )
 from relpose_ros.training.feature_shards import write_feature_shards
+from relpose_ros.training.imagenet import imagenet_backbone
 from relpose_ros.training.objective import ObjectiveSettings, scene_features
 from relpose_ros.training.trainer import Trainer, TrainingError, TrainingSettings
 
@@ -194,6 +196,20 @@ def test_a_pretrained_backbone_can_be_trained_from_its_first_map_on(shards, froz
     for name in own:
         stored = run.network.state_dict()[backbone + name].half().float()
         assert begun[backbone + name].equal(stored if name in moved else public[name])
+
+
+def test_the_command_trains_on_features_with_and_without_the_backbone(fake_shard, tmp_path):
+    with new_shard(tmp_path / "shards" / "00000") as arrays:
+        arrays |= fake_shard(1, 8, 128, 0)
+    features, public = tmp_path / "features", imagenet_backbone().state_dict()
+    assert cli.main(["features", str(tmp_path / "shards"), "--output", str(features), "--plain"]) == 0
+    for name, options in (("frozen", []), ("trained", ["--backbone-rate", "0.3"])):
+        command = ["train", str(tmp_path / name), "--scans", str(features), "--images", "1", *options]
+        assert cli.main(command) == 0
+        backbone = load_network(tmp_path / name / "weights.safetensors").feature_extractor.feature_extractor
+        changed = {layer for layer, value in backbone.state_dict().items() if not value.equal(public[layer])}
+        assert ("stages.5.0.expand.weight" in changed) == (name == "trained")
+        assert "stages.2.0.expand.weight" not in changed
 
 
 def test_maps_behind_the_first_are_worked_out_where_they_are_missing(shards, frozen):
