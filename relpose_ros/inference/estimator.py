@@ -107,6 +107,8 @@ def _require_scan(what: str, views: int) -> None:
         raise ScanError(f"{what} {views} views; an estimate takes {MIN_VIEWS} to {MAX_VIEWS}.")
 
 
+OWN_THREADS = torch.get_num_threads()
+"""As many as torch takes by itself."""
 LARGEST_LOSS = 0.5
 """Nats a pair: refined poses that lose more of the joint energy contradict the pairs, and are not taken."""
 
@@ -160,19 +162,20 @@ class Estimator:
 
         Args:
             path: of a weights file; None for the shipped compact weights.
-            threads: for torch and OpenCV, of the whole process; None or 0 leaves their own choice.
+            threads: for torch and OpenCV, of the whole process; 0 for as many as they take by themselves,
+                None leaves them as they are.
             evidence: what else than the network to rest on.
             backbone_in_bfloat16: of the published network: sooner on some processors, and less exact.
 
         Raises:
             NetworkFileError: if the file is missing or is none of ours.
         """
-        if threads:
-            torch.set_num_threads(threads)
+        if threads is not None:
+            torch.set_num_threads(threads or OWN_THREADS)
             with contextlib.suppress(ImportError):  # the network alone does without it
                 import cv2
 
-                cv2.setNumThreads(threads)
+                cv2.setNumThreads(threads or -1)
         network = load_network(path)
         network.backbone_in_bfloat16 = backbone_in_bfloat16
         stored = read_metadata(path).get("calibration")

@@ -45,6 +45,9 @@ ROUNDING = 1e-5
 """Of a squared distance of descriptors."""
 SQUEEZE = 2.0
 """Factor by which the width of the picture is divided: surfaces turned by 60 degrees."""
+WIDEST_RAY = 20.0
+"""Of a ray's coordinates, 87 degrees off the axis: so far out no calibration holds. OpenCV gives a million
+where it finds no ray that the lens would have bent to a pixel."""
 SAME_PLACE = 2.0
 """Pixels within which a feature of the squeezed picture is one of the picture as it is."""
 
@@ -80,7 +83,8 @@ class LocalFeatures:
     unbounded: bool = False
     """Whether neither box nor mask tells the object from what stands around it, although they should."""
     outline: Outline | None = None
-    """None where the box is the whole picture, which says nothing of the object."""
+    """None where the box is the whole picture, which says nothing of the object, or where no rays are known
+    of its corners."""
 
     @cached_property
     def extent(self) -> float:
@@ -118,24 +122,26 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
     found = [_detect(grey, region, MOST_FEATURES), _detect(narrow, narrow_region, MOST_SQUEEZED)]
     found[1][0][:, 0] *= grey.shape[1] / narrow.shape[1]
     points, orientations, descriptors = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    plain = len(found[0][0])
-    places = _places(points, plain)
     # Sizes are whole: the sides may have been scaled a little differently.
     pixels = points * [picture.shape[1] / grey.shape[1], picture.shape[0] / grey.shape[0]]
     pixels += [left + view.origin[0], top + view.origin[1]]
     intrinsics = view.intrinsics or Intrinsics.guessed(view.full_width, view.full_height)
     focal = np.array([intrinsics.fx, intrinsics.fy])
     rays = _straightened((pixels - [intrinsics.cx, intrinsics.cy]) / focal, view.distortion)
+    known = _known(rays)
+    plain = int(known[: len(found[0][0])].sum())
+    places = _places(points[known], plain)
     pixel = 1 / (scale * float(focal.mean()))
     box = view.box
     full = box.x0 <= 0 and box.y0 <= 0 and box.x1 >= view.full_width and box.y1 >= view.full_height
     corners = (np.array([[box.x0, box.y0], [box.x1, box.y1]]) - [intrinsics.cx, intrinsics.cy]) / focal
     corners = _straightened(corners, view.distortion)
+    outline = Outline(corners.mean(0), float(np.linalg.norm(corners[1] - corners[0])))
     return LocalFeatures(
-        *(rays, orientations, descriptors, places, plain, pixel),
+        *(rays[known], orientations[known], descriptors[known], places, plain, pixel),
         guessed=view.intrinsics is None,
         unbounded=full and view.mask is None and not surroundings,
-        outline=None if full else Outline(corners.mean(0), float(np.linalg.norm(corners[1] - corners[0]))),
+        outline=None if full or not _known(corners).all() else outline,
     )
 
 
@@ -209,6 +215,11 @@ def _straightened(rays: FloatArray, distortion: Distortion | None) -> FloatArray
         return rays
     undo: Any = cv2.fisheye.undistortPoints if distortion.equidistant else cv2.undistortPoints
     return np.asarray(undo(rays[:, None], np.eye(3), np.array(distortion.coefficients))[:, 0], np.float64)
+
+
+def _known(rays: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which rays (K, 2) the lens's model tells."""
+    return np.asarray((np.abs(rays) < WIDEST_RAY).all(1))
 
 
 def _squeezed(grey: Any, region: Any) -> tuple[Any, Any]:

@@ -159,6 +159,10 @@ class ScanNode(LifecycleNode):
         self._inputs: list[Any] = []
         self._services_of_scan: list[Any] = []
         self._outputs: dict[str, Any] = {}
+        self._shown: Result | None = None
+        """The last estimate that stands."""
+        self._unsaid: list[Result] = []
+        """What is to be taken back as soon as somebody can hear it."""
         self._jump: Any = None
         self._incompatible: dict[str, tuple[bool, str]] = {}
         self._longest_callback_s: dict[str, float] = {}
@@ -246,6 +250,7 @@ class ScanNode(LifecycleNode):
         """Take messages and answer services from now on."""
         result = super().on_activate(state)
         self._active = True
+        self._submit(self._publish_unsaid)
         self._ask_for_estimate()
         topics = ", ".join(each.topic_name for each in self._inputs)
         self.get_logger().info(f"Waiting for views on {topics}.")
@@ -260,7 +265,10 @@ class ScanNode(LifecycleNode):
 
     @_guarded
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release everything that configuring made."""
+        """Release everything that configuring made; once active again, the node takes back what it told."""
+        if self._scanner is not None:
+            self._scanner.reset("the node was cleaned up")
+            self._unsaid += self._scanner.estimate_pending()
         self._release()
         return super().on_cleanup(state)
 
@@ -378,8 +386,10 @@ class ScanNode(LifecycleNode):
 
     def _release(self) -> None:
         self._active = False
-        if self._worker is not None:
-            self._worker.shutdown(wait=True, cancel_futures=True)
+        with self._jobs_lock:
+            worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.shutdown(wait=True, cancel_futures=True)
         if self._jump is not None:
             self._jump.unregister()
         for subscription in self._inputs:
@@ -389,7 +399,7 @@ class ScanNode(LifecycleNode):
         for publisher in self._outputs.values():
             self.destroy_lifecycle_publisher(publisher)
         self._inputs, self._services_of_scan, self._outputs = [], [], {}
-        self._worker = self._scanner = self._estimator = self._jump = None
+        self._scanner = self._estimator = self._jump = self._shown = None
         self._jobs = set()
         self._estimate_asked = self._failing = False
         self._incompatible.clear()
@@ -492,11 +502,22 @@ class ScanNode(LifecycleNode):
             if self._closing:
                 return
             estimate, scan = result.estimate, result.scan
+            shown = self._shown
             self._outputs["~/estimate"].publish(estimate_message(estimate, scan, types, frame))
-            self._outputs["~/poses"].publish(pose_array(estimate, scan, types, frame))
-            self._outputs["~/markers"].publish(markers(estimate, scan, types, frame))
+            if estimate.cameras or shown is None or shown.estimate.object_id == estimate.object_id:
+                self._outputs["~/poses"].publish(pose_array(estimate, scan, types, frame))
+                self._outputs["~/markers"].publish(markers(estimate, scan, types, frame))
+                self._shown = result if estimate.cameras else None
+            else:
+                # Who joins late hears the last message: that is to be what stands of the object shown.
+                again = estimate_message(shown.estimate, shown.scan, types, frame)
+                self._outputs["~/estimate"].publish(again)
             done = f"{len(scan.views)} views in {estimate.seconds:.2f} s: " if estimate.cameras else ""
             self.get_logger().info(f"{estimate.object_id}: {done}{estimate.status}")
+
+    def _publish_unsaid(self) -> None:
+        unsaid, self._unsaid = self._unsaid, []
+        self._publish(unsaid)
 
     # Services.
 
@@ -530,7 +551,8 @@ class ScanNode(LifecycleNode):
             response.success, response.message = False, "The node stopped before the estimate was made."
         elif not (estimates := [each.estimate for each in results if each.estimate.cameras]):
             response.success = False
-            response.message = "The estimate failed." if self._failing else "No object has two views yet."
+            failure = scanner.statistics().last_failure if self._failing else ""
+            response.message = failure or "No object has two views yet."
         else:
             response.success = True
             response.message = "; ".join(f"{each.object_id}: {each.status}" for each in estimates)

@@ -202,6 +202,7 @@ def _statistics_values(statistics: Statistics) -> Iterator[tuple[str, str]]:
             i, j = scan.weakest_pair
             yield f"{object_id} weakest pair", f"{i}-{j} ({scan.weakest_probability:.2f} within 15 degrees)"
     yield "waiting for a counterpart", str(statistics.waiting)
+    yield "images without a camera info", str(statistics.images_alone)
     yield "camera infos without an image", str(statistics.infos_alone)
     yield "failed estimates", str(statistics.failed)
     if statistics.last_failure:

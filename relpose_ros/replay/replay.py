@@ -47,6 +47,7 @@ MARKERS_TOPIC = "/scan_node/markers"
 ESTIMATES_FOLDER, SCAN_FILE, REPORT_FILE = "estimates", "scan.json", "report.html"
 SHOWN_REASONS = 6
 """Kinds of rejected messages that are told apart at the end."""
+WAITED = "before the bag ended, or the parameter pairing_queue the wait"
 
 
 class ShowsDistributions(Protocol):
@@ -103,6 +104,8 @@ def replay(
     rejected = rejections.most_common()
     for topic, count in sorted(reader.unreadable.items()):
         rejected.append((f"{topic}: the message is not what its type says.", count))
+    if recordings and (alone := _images_alone(scanner)):
+        rejected.append((f"A picture found no camera info of its stamp {WAITED}.", alone))
     for example, count in rejected[:SHOWN_REASONS]:
         logger.warning("%d rejected: %s", count, example)
     if len(rejected) > SHOWN_REASONS:
@@ -212,13 +215,16 @@ def _why_nothing(bag: Path, scanner: Scanner, rejected: Sequence[tuple[str, int]
     if statistics.failed:
         return f"{bag} gave no estimate: {statistics.last_failure}"
     reasons = f"; {rejected[0][1]} messages were rejected, such as: {rejected[0][0]}" if rejected else "."
-    if not held and not rejected and statistics.waiting:
-        return (
-            f"{bag} gave no estimate: no image and camera info with the same stamp, "
-            f"{statistics.waiting} of them wait for their counterpart."
-        )
+    if not held and not rejected and (alone := _images_alone(scanner)):
+        return f"{bag} gave no estimate: {alone} pictures came, and no camera info of their stamps {WAITED}."
     count = {0: "no view", 1: "one view"}.get(held, f"{held} views")
     return f"{bag} gave no estimate: {count} could be used, and an estimate takes two of one object{reasons}"
+
+
+def _images_alone(scanner: Scanner) -> int:
+    """Images that found no camera info of their stamp."""
+    statistics = scanner.statistics()
+    return statistics.images_alone + statistics.waiting
 
 
 def _folders(recordings: Mapping[str, Recording]) -> dict[str, Recording]:

@@ -34,6 +34,10 @@ PoseWithCovarianceStamped."""
 MIN_BOX_SIDE = 8
 """Pixels: a smaller box shows nothing of an object that a network could use."""
 
+MAX_BOX_SIDE = 2**13
+"""Pixels: the network's crop is a square on the longer side, however short the other one is, and would take
+gigabytes."""
+
 MAX_FULL_SIDE = 2**16
 """Pixels: a larger full image is garbage."""
 
@@ -76,8 +80,9 @@ class _Picture:
         return self.width, self.height
 
 
-DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
-"""By the names of sensor_msgs/distortion_models.hpp, how many numbers each may have."""
+DISTORTION_MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
+"""By the names of sensor_msgs/distortion_models.hpp, how many numbers each may have. OpenCV's calibration
+gives the rational polynomial twelve with a thin prism, and fourteen with a tilted sensor."""
 
 RECTIFIED_TOPIC = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
 """As image_proc calls them: image_rect, image_rect_color."""
@@ -162,6 +167,8 @@ def view_from_image(image: Any, info: Any, source: Source, rectification: str = 
             if full == (0, 0):  # nobody calibrated the camera
                 full = picture.size
             box = BoundingBox(0.0, 0.0, float(full[0]), float(full[1]))
+        elif full == (0, 0):
+            raise source.rejection("width and height in camera_info are 0, and its roi is not: fill them in")
         else:
             box = _box(info.roi)
         if picture.size == full:
@@ -242,6 +249,9 @@ def _view(
         )
     if box.x0 < shown[0] or box.y0 < shown[1] or box.x1 > shown[2] or box.y1 > shown[3]:
         raise source.rejection(f"{_box_text(box)} lies outside the picture, which shows {list(shown)}")
+    if max(box.width, box.height) > MAX_BOX_SIDE:
+        text = f"{_box_text(box)} is too large: a side has at most {MAX_BOX_SIDE} pixels"
+        raise source.rejection(f"{text}; shrink the picture")
     centre_x, centre_y = (box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2
     half = _REGION_SCALE * max(box.width, box.height) / 2
     x0, y0 = max(math.floor(centre_x - half), shown[0]), max(math.floor(centre_y - half), shown[1])
@@ -283,6 +293,10 @@ def _origin_of_crop(
         return 0, 0
     if picture.size == (box.width, box.height):
         return int(box.x0), int(box.y0)
+    if not any(full):
+        raise source.rejection(
+            "full_width and full_height are 0: fill in the size of the camera's full image"
+        )
     text = (
         f"the picture has {_size_text(picture.size)} pixels: neither the full image's {_size_text(full)} nor "
     )
@@ -338,14 +352,17 @@ def _distortion(info: Any, source: Source) -> Distortion | None:
     coefficients, model = np.asarray(info.d, np.float64), str(info.distortion_model)
     if not np.isfinite(coefficients).all():
         raise source.rejection(f"the distortion d holds what is no number: {coefficients.tolist()}")
-    if not coefficients.any():
+    # A lens that bends by the angle alone has four zeros; without any numbers nobody calibrated it.
+    if not coefficients.any() and not (model == "equidistant" and len(coefficients)):
         return None
     lengths = DISTORTION_MODELS.get(model)
     if lengths is None:
         text = f"the distortion_model is {model[:40]!r}, none of {', '.join(DISTORTION_MODELS)}"
         raise source.rejection(f"{text}: send rectified pictures, with parameter rectification: rectified")
     if len(coefficients) not in lengths:
-        text = f"the {model} distortion d has {len(coefficients)} numbers: give {lengths[-1]}"
+        text = (
+            f"the {model} distortion d has {len(coefficients)} numbers: give {' or '.join(map(str, lengths))}"
+        )
         raise source.rejection(text)
     return Distortion(tuple(coefficients.tolist()), equidistant=model == "equidistant")
 
@@ -390,6 +407,8 @@ class Pairing:
         """
         self.limit = limit
         self.backward_jump_ns = backward_jump_ns
+        self.images_alone = 0
+        """Images that made room for later ones before a camera info of their stamp came."""
         self._queues: dict[tuple[str, Kind], _Queue] = {}
 
     def add(self, kind: Kind, arrival: Arrival, camera: str) -> list[ImagePair]:
@@ -403,7 +422,7 @@ class Pairing:
         info = self._queue(camera, "camera_info").messages.get(stamp_ns)
         if info is not None:
             return [ImagePair(arrival, info)]
-        self._queue(camera, kind).put(arrival, self.limit)
+        self.images_alone += self._queue(camera, kind).put(arrival, self.limit)
         return []
 
     def clear(self) -> None:
@@ -429,10 +448,13 @@ class _Queue:
         self._newest_ns = 0
         self._suspect_ns: int | None = None
 
-    def put(self, arrival: Arrival, limit: int) -> None:
+    def put(self, arrival: Arrival, limit: int) -> int:
+        """Let a message wait. -> how many others made room for it."""
         self.messages[arrival.source.stamp_ns] = arrival
-        while len(self.messages) > limit:
+        surplus = max(0, len(self.messages) - limit)
+        for _ in range(surplus):
             self.messages.popitem(last=False)
+        return surplus
 
     def follow_clock(self, stamp_ns: int, backward_jump_ns: int) -> None:
         """Forget what lies in the future once two messages in order agree that time jumped back."""

@@ -6,6 +6,7 @@ import logging
 from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from weakref import WeakSet
 
 import numpy as np
 
@@ -55,6 +56,8 @@ class Work:
     views: tuple[View, ...]
     newcomer: View | None
     """The view whose place in the scan depends on the estimate (keep policy "spread"), or None."""
+    without: View | None
+    """A view held that is left out to see whether estimates fail of it, or None."""
     epoch: int
     """The buffer's count of forgetting, when the work was given out."""
 
@@ -88,6 +91,13 @@ class ScanBuffer:
         """Stamp and frame, which are what tells pictures apart whatever their topic, and that topic."""
         self._changed = False
         self._failed = False
+        """Whether the latest estimate failed, and no view came since."""
+        self._doubted: deque[View] = deque()
+        """Views that estimates may fail of, which are to be left out in turn."""
+        self._failed_before = False
+        """Whether estimates failed since the last one that did not."""
+        self._estimated: WeakSet[View] = WeakSet()
+        """Views of the last estimate that did not fail, as far as they are still held."""
         self._base: ScanEstimate | None = None
         """Of exactly the views held, where there is one."""
         self._epoch = 0
@@ -106,8 +116,7 @@ class ScanBuffer:
 
         Saves decoding it.
         """
-        newest_ns = self._newest_ns()
-        if newest_ns is None or self._jumps_back(stamp_ns, frame_id, topic):
+        if not self._all() or self._jumps_back(stamp_ns, frame_id, topic):
             return None
         if self._confirms_jump(stamp_ns, frame_id, topic):
             return None
@@ -117,11 +126,17 @@ class ScanBuffer:
             return Decision(False, f"{text}: {advice}", rejected=True)
         if self._was_seen(stamp_ns, frame_id):
             return Decision(False, "a view with this stamp and frame was seen already")
-        if stamp_ns < newest_ns:
-            late = f"it is {(newest_ns - stamp_ns) / 1e9:.3f} s older than the scan of {self.object_id!r}"
-            newest = f"whose newest view has stamp {stamp_text(newest_ns)}"
-            order = "views of all cameras have to come in the order of their stamps"
-            return Decision(False, f"{late}, {newest}: {order}", rejected=True)
+        own_ns = self._newest_of.get((topic, frame_id))
+        if own_ns is not None and stamp_ns < own_ns:
+            late = (
+                f"it is {(own_ns - stamp_ns) / 1e9:.3f} s older than the newest view of {self.object_id!r} on"
+            )
+            order = "views of a camera have to come in the order of their stamps"
+            return Decision(False, f"{late} this topic with frame_id {frame_id!r}: {order}", rejected=True)
+        if self._views and stamp_ns < self._views[0].stamp_ns:
+            late = f"it is {(self._views[0].stamp_ns - stamp_ns) / 1e9:.3f} s older than the first view"
+            text = f"{late} of {self.object_id!r}, in whose axes the poses are told"
+            return Decision(False, f"{text}: the cameras' pictures have to come sooner", rejected=True)
         full = len(self._views) >= self._settings.max_views
         if full and (self._settings.keep == "first" or self._is_paused(stamp_ns)):
             self._note_arrival(stamp_ns, frame_id, topic)
@@ -168,17 +183,21 @@ class ScanBuffer:
         """What to estimate next, which counts as begun; None where there is nothing to do."""
         if self._changed and len(self._views) >= MIN_VIEWS:
             self._changed = False
-            return Work(self.views, None, self._epoch)
+            return Work(self.views, None, None, self._epoch)
+        if self._doubted:
+            doubted = self._doubted.popleft()
+            others = tuple(view for view in self._views if view is not doubted)
+            return Work(others, None, doubted, self._epoch)
         if self._candidates and self._base is not None:
             self._on_trial = self._candidates.popleft()
             redundant = most_redundant(viewing_directions(self._base))
             kept = [view for index, view in enumerate(self._views) if index != redundant]
-            return Work((*kept, self._on_trial), self._on_trial, self._epoch)
+            return Work((*kept, self._on_trial), self._on_trial, None, self._epoch)
         return None
 
     def has_work(self) -> bool:
         """Whether `work` has something to give."""
-        if self._changed and len(self._views) >= MIN_VIEWS:
+        if self._doubted or (self._changed and len(self._views) >= MIN_VIEWS):
             return True
         return bool(self._candidates) and self._base is not None
 
@@ -196,6 +215,14 @@ class ScanBuffer:
         """
         if work.epoch != self._epoch:
             return False
+        self._estimated = WeakSet(work.views)
+        self._failed_before = False
+        self._doubted.clear()
+        if work.without is not None:
+            text = "The view of %r with stamp %s is let go: estimates fail with it, and not without it."
+            _logger.warning(text, self.object_id, stamp_text(work.without.stamp_ns))
+            self._forget([work.without])
+            self._changed = work.views != self.views
         if work.newcomer is None:
             self._base = estimate if work.views == self.views else None
             return True
@@ -214,13 +241,19 @@ class ScanBuffer:
         return True
 
     def give_up(self, work: Work) -> None:
-        """Take note that an estimate failed: the views stay, and the next view has it tried again."""
-        if work.epoch != self._epoch:
+        """Take note that an estimate failed: the views stay, and the next view has it tried again.
+
+        Where that fails too, estimates without one or the other of the views that came since the last one
+        that did not fail tell which of them it fails of, if it is one.
+        """
+        if work.epoch != self._epoch or work.without is not None:
             return
-        self._failed = True
         if work.newcomer is not None:
             self._on_trial = None
             self._decline()
+        elif self._failed_before and len(self._views) > MIN_VIEWS:
+            self._doubted = deque(view for view in self._views if view not in self._estimated)
+        self._failed = self._failed_before = True
 
     def drop_last(self) -> View | None:
         """Forget the newest view held and give it back; None where there is none.
@@ -243,7 +276,7 @@ class ScanBuffer:
             self._forget(surplus)
 
     def _take(self, view: View, topic: str) -> Decision:
-        """Take a view that no other is newer than."""
+        """Take a view that no other of its camera is newer than."""
         self._note_arrival(view.stamp_ns, view.frame_id, topic)
         full = len(self._views) >= self._settings.max_views
         if full and self._settings.keep == "first":
@@ -257,7 +290,8 @@ class ScanBuffer:
         if full:
             del self._views[0]
             self.dropped += 1
-        self._views.append(view)
+        later = sum(each.stamp_ns > view.stamp_ns for each in self._views)
+        self._views.insert(len(self._views) - later, view)
         self._changed, self._base = True, None
         return Decision(True)
 
@@ -275,7 +309,8 @@ class ScanBuffer:
     def _note_arrival(self, stamp_ns: int, frame_id: str, topic: str) -> None:
         """Time goes on in this topic: whatever lay far behind was garbage."""
         self._seen.append((stamp_ns, frame_id, topic))
-        self._newest_on[topic] = stamp_ns
+        # A camera that delivers later does not turn the topic's clock back.
+        self._newest_on[topic] = max(stamp_ns, self._newest_on.get(topic, stamp_ns))
         self._newest_of.pop((topic, frame_id), None)
         self._newest_of[topic, frame_id] = stamp_ns
         if len(self._newest_of) > _SEEN:  # a name of its own for each picture
@@ -356,6 +391,7 @@ class ScanBuffer:
         self._epoch += 1
         left = [view for view in self._all() if view not in views]
         self._on_trial = None
+        self._doubted.clear()
         self._pause_ns = self._paused_until_ns = 0
         self._views = left[: self._settings.max_views]
         self._candidates = deque(left[self._settings.max_views :])
@@ -369,9 +405,6 @@ class ScanBuffer:
         """The views held and those whose place is not decided yet, oldest first."""
         undecided = [] if self._on_trial is None else [self._on_trial]
         return [*self._views, *undecided, *self._candidates]
-
-    def _newest_ns(self) -> int | None:
-        return max((view.stamp_ns for view in self._all()), default=None)
 
 
 def viewing_directions(estimate: ScanEstimate) -> FloatArray:

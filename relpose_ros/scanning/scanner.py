@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from relpose_ros.estimates import ScanEstimate
     from relpose_ros.scanning.incoming import ImagePair, Source
+    from relpose_ros.scanning.scan_buffer import Decision
     from relpose_ros.scanning.settings import ScanSettings
     from relpose_ros.views import View
 
@@ -121,6 +122,8 @@ class Statistics:
     """Images that wait for a camera info of their stamp."""
     unpaired_s: float | None
     """Seconds since the first image that found none, if no other image has found one since; else None."""
+    images_alone: int
+    """Images that found no camera info of their stamp before `ScanSettings.pairing_queue` later ones came."""
     infos_alone: int
     """Camera infos that found no image in time."""
     images_missing: bool
@@ -166,6 +169,7 @@ class Scanner:
         self._infos = _InfoRecord()
         self._failed = 0
         self._last_failure = ""
+        self._last_error = ""
 
     def receive(self, kind: Kind, topic: str, message: Any, camera: str = "") -> Receipt:
         """Take one message in. Never raises for a bad message: the receipt says what was wrong.
@@ -291,7 +295,7 @@ class Scanner:
     def statistics(self) -> Statistics:
         """A snapshot for diagnostics."""
         with self._receiving:
-            waiting = self._pairing.waiting()
+            waiting, images_alone = self._pairing.waiting(), self._pairing.images_alone
             since = self._unpaired_since
             self._infos.settle(self._clock())
             infos_alone, images_missing = self._infos.alone, self._infos.most_are_alone()
@@ -303,6 +307,7 @@ class Scanner:
                 },
                 scans={object_id: state.snapshot() for object_id, state in self._scans.items()},
                 waiting=waiting,
+                images_alone=images_alone,
                 unpaired_s=None if since is None else self._clock() - since,
                 infos_alone=infos_alone,
                 images_missing=images_missing,
@@ -381,14 +386,16 @@ class Scanner:
                 if known is None
                 else known.buffer.declines(source.stamp_ns, source.frame_id, source.topic)
             )
+            if decision is not None:
+                self._note_seen(object_id, decision)
         if decision is None:
             view = decode()
             with self._state:
                 state = self._scans.get(object_id) or self._begin_scan(object_id)
                 decision = state.buffer.add(view, source.topic)
+                self._note_seen(object_id, decision)
                 if decision.accepted:
                     state.arrived = self._clock()
-                    self._scans[object_id] = self._scans.pop(object_id)
                     for topic in topics:
                         self._topics[topic].used += 1
                     self._claim_robot_pose(view.stamp_ns)
@@ -398,6 +405,11 @@ class Scanner:
         if decision.rejected:
             return self._rejected(source.topic, object_id, text)
         return Receipt(False, object_id, text)
+
+    def _note_seen(self, object_id: str, decision: Decision) -> None:
+        """The object seen last stands last, also where its scan needs no more views."""
+        if not decision.rejected:
+            self._scans[object_id] = self._scans.pop(object_id)
 
     def _begin_scan(self, object_id: str) -> _ScanState:
         if len(self._scans) >= self._settings.max_scans:
@@ -459,13 +471,16 @@ class Scanner:
             except Exception as err:
                 what = f"The estimate of {scan.object_id!r} from {len(scan.views)} views"
                 text = f"{what} failed: {str(err).rstrip('.')}."
-                # A sentence for the user needs no traceback, a defect does.
-                trace = not isinstance(err, RelPoseError)
-                _logger.error("%s The views are kept.", text, exc_info=trace)
                 with self._state:
                     state.buffer.give_up(work)
+                    if work.without is not None:  # a trial, of a failure that was told
+                        continue
                     self._failed += 1
                     self._last_failure = text
+                    # A sentence for the user needs no traceback, a defect does, once.
+                    trace = not isinstance(err, RelPoseError) and repr(err) != self._last_error
+                    self._last_error = repr(err)
+                _logger.error("%s The views are kept.", text, exc_info=trace)
                 continue
             with self._state:
                 self._move_taken_back(results)

@@ -209,7 +209,7 @@ class ScanSettings:
 
         return Estimator.from_weights(
             weights or self.weights_path,
-            self.threads or None,
+            self.threads,
             self.evidence_settings,
             backbone_in_bfloat16=self.precision == "bfloat16",
         )

@@ -14,7 +14,7 @@ from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference import bundle_adjustment, matches
 from relpose_ros.inference.bundle_adjustment import Refined
 from relpose_ros.inference.calibration import Calibration
-from relpose_ros.inference.estimator import Estimator, EvidenceSettings, ScanError
+from relpose_ros.inference.estimator import OWN_THREADS, Estimator, EvidenceSettings, ScanError
 from relpose_ros.inference.predictions import regressed_poses
 from relpose_ros.network.checkpoint import random_network, write_network
 from relpose_ros.network.features import SceneFeatures
@@ -560,3 +560,16 @@ def test_weights_with_evidence(network, tmp_path, ball):
     off = Estimator.from_weights(tmp_path / "plain.safetensors", evidence=EvidenceSettings(use="network"))
     assert off.estimate(two).pairs[0].evidence == Evidence.LEARNED
     assert Estimator.from_weights(tmp_path / "plain.safetensors").estimate(two).pairs[0].evidence == 3
+
+
+def test_no_number_of_threads_is_torchs_own():
+    before = torch.get_num_threads()
+    try:
+        Estimator.from_weights(threads=OWN_THREADS + 1)
+        assert torch.get_num_threads() == OWN_THREADS + 1
+        Estimator.from_weights()
+        assert torch.get_num_threads() == OWN_THREADS + 1
+        Estimator.from_weights(threads=0)
+        assert torch.get_num_threads() == OWN_THREADS
+    finally:
+        torch.set_num_threads(before)

@@ -196,6 +196,23 @@ def test_rays_are_straightened_where_a_lens_bent_them(textured, distortion, bend
     np.testing.assert_allclose(bend(straight, np.array(distortion.coefficients))[:, 0], bent, atol=1e-4)
 
 
+def test_where_no_ray_is_known_of_a_pixel_nothing_is_made_of_it(textured):
+    """A fisheye model that turns back before the corners of the picture."""
+    lens = Distortion((0.1, -0.05, -0.02, -0.01), equidistant=True)
+    view = textured(0, intrinsics=Intrinsics(50, 50, 100, 80))
+    narrow, wide = (
+        find_features(replace(view, distortion=lens, box=box))
+        for box in (BoundingBox(60, 50, 140, 110), BoundingBox(5, 5, 195, 155))
+    )
+    assert narrow.outline is not None
+    assert wide.outline is None
+    for features in (narrow, wide):
+        assert 0 < len(features.rays) == len(features.descriptors) == len(features.places)
+        assert np.abs(features.rays).max() < 20
+        assert features.places.max() < len(features.rays)
+    assert len(wide.rays) < len(find_features(replace(view, box=BoundingBox(5, 5, 195, 155))).rays)
+
+
 def test_a_box_or_a_mask_bounds_the_object(textured):
     whole = BoundingBox(0, 0, 200, 160)
     view = replace(textured(0), box=whole)

@@ -95,6 +95,7 @@ def test_diagnostics_tell_the_worst_first() -> None:
         scans={"mug": ScanStatistics(4, 3, 1, 0.25, "enough", (1, 2), 0.875)},
         waiting=3,
         unpaired_s=None,
+        images_alone=2,
         infos_alone=7,
         images_missing=False,
         failed=0,

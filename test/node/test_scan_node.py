@@ -114,6 +114,25 @@ def test_what_was_told_of_views_that_are_forgotten_is_taken_back(node: Any, grap
     assert [(each.header, each.action) for each in shown.markers] == [(answer.header, Marker.DELETEALL)]
 
 
+def test_what_stands_of_another_object_is_still_shown(node: Any, graph: Any, make: Any) -> None:
+    assert graph.set_parameter("max_scans", 2) == (True, "")
+    graph.publish(OBJECT_VIEW, *(make.object_view(stamp, "fork") for stamp in (10.0, 11.0)))
+    graph.estimate_of("fork", views=2)
+    graph.publish(OBJECT_VIEW, *(make.object_view(stamp, "knife") for stamp in (20.0, 21.0)))
+    last = graph.estimate_of("knife", views=2)
+    graph.publish(OBJECT_VIEW, make.object_view(30.0, "spoon"))
+    graph.wait_until(lambda: [each for each in graph.taken_back if each.object_id == "fork"], "no fork")
+    late = {
+        topic: graph.collect(kind, f"/scan_node/{topic}", LAST)
+        for topic, kind in (("estimate", ScanEstimate), ("poses", PoseArray), ("markers", MarkerArray))
+    }
+    graph.wait_until(lambda: all(late.values()), "the last message of each topic")
+    assert late["estimate"] == [last]
+    assert [len(each.poses) for each in late["poses"]] == [2]
+    assert [each.action for each in late["markers"][0].markers].count(Marker.ADD) > 0
+    assert graph.set_parameter("max_scans", 4) == (True, "")
+
+
 def test_objects_are_estimated_apart(node: Any, graph: Any, make: Any) -> None:
     views = [make.object_view(10.0 + k, object_id) for k in range(2) for object_id in ("mug", "bowl")]
     graph.publish(OBJECT_VIEW, *views, make.object_view(12.0, "mug"))
@@ -362,6 +381,8 @@ def test_transitions(node: Any, graph: Any, make: Any, tmp_path: Path) -> None:
         assert graph.change_state(Transition.TRANSITION_CONFIGURE)
         assert graph.change_state(Transition.TRANSITION_ACTIVATE)
     assert threads[0] == threads[1]
+    status = "no view is left: the node was cleaned up"
+    graph.wait_until(lambda: [each.object_id for each in graph.taken_back if each.status == status], status)
     graph.publish(OBJECT_VIEW, *(make.object_view(20.0 + k, "mug") for k in range(4)))
     assert stamp_s(graph.estimate_of("mug", views=4)) == 23.0
 

@@ -314,6 +314,25 @@ def test_rejected_messages_are_counted_by_their_reason(
     assert [view["stamp_ns"] // 10**9 for view in scan["views"]] == [1, 3, 5]
 
 
+def test_pictures_without_a_camera_info_are_told(
+    tmp_path: Path, capture: Capture, fake_estimator: Fake, caplog: pytest.LogCaptureFixture, rewrite: Rewrite
+) -> None:
+    folder, truth = capture
+    pack(folder, tmp_path / "good")
+
+    def lose(record: Record) -> Iterable[Record]:
+        if record.topic != "/camera_info" or record.log_time_ns not in (2 * 10**9, 4 * 10**9):
+            yield record
+
+    rewrite(tmp_path / "good", tmp_path / "bag", lose)
+    for name, limit in (("waiting", 30), ("crowded", 1)):
+        caplog.clear()
+        with caplog.at_level(logging.WARNING, "relpose_ros"):
+            settings = ScanSettings(pairing_queue=limit)
+            replay(tmp_path / "bag", tmp_path / name, estimator=fake_estimator(truth), settings=settings)
+        assert "2 rejected: A picture found no camera info of its stamp before the bag ended" in caplog.text
+
+
 def test_no_estimate_is_an_error_that_says_why(
     tmp_path: Path, capture: Capture, fake_estimator: Fake, rewrite: Rewrite
 ) -> None:
@@ -339,7 +358,9 @@ def test_no_estimate_is_an_error_that_says_why(
         yield record
 
     rewrite(tmp_path / "good", tmp_path / "apart", late)
-    with pytest.raises(ReplayError, match="same stamp"):
+    with pytest.raises(
+        ReplayError, match="5 pictures came, and no camera info of their stamps before the bag"
+    ):
         replay(tmp_path / "apart", tmp_path / "out", estimator=fake_estimator(truth))
 
     class Broken:

@@ -105,6 +105,7 @@ WRONG_OBJECT_VIEWS: list[tuple[dict[str, Any], str]] = [
     ),
     ({"box": (2**32 - 1, 8, 2**32 - 1, 16)}, "lies outside the full image"),
     ({"full": (0, 0), "crop": (0, 0, 40, 32)}, "the full image cannot have 0 x 0 pixels"),
+    ({"full": (0, 0)}, "full_width and full_height are 0: fill in the size of the camera's full image"),
     ({"full": (2**32 - 1, 32), "crop": (0, 0, 40, 32)}, "the full image cannot have 4294967295 x 32 pixels"),
     (
         {"full": (80, 64)},
@@ -240,9 +241,30 @@ def test_a_straight_lens_and_an_unknown_camera_have_no_distortion(messages: Any)
     assert view_of_pair(messages.rgb(picture()), info).distortion is None
 
 
+def test_a_fisheye_lens_of_four_zeros_bends_by_the_angle_alone(messages: Any) -> None:
+    info = messages.camera_info(40, 32)
+    info.distortion_model, info.d = "equidistant", np.zeros(4)
+    view = view_of_pair(messages.rgb(picture()), info)
+    assert view.distortion == Distortion((0.0, 0.0, 0.0, 0.0), equidistant=True)
+    info.d = np.zeros(0)
+    assert view_of_pair(messages.rgb(picture()), info).distortion is None
+
+
+@pytest.mark.parametrize("count", [8, 12, 14])
+def test_a_rational_polynomial_may_have_a_prism_and_a_tilt(messages: Any, count: int) -> None:
+    info = messages.camera_info(40, 32)
+    info.distortion_model, info.d = "rational_polynomial", np.full(count, 0.01)
+    assert view_of_pair(messages.rgb(picture()), info).distortion == Distortion((0.01,) * count)
+
+
 @pytest.mark.parametrize(
     ("model", "first", "said"),
-    [("plumb_bob", NAN, "no number"), ("omni", 0.1, "'omni'"), ("equidistant", 0.1, "5 numbers: give 4")],
+    [
+        ("plumb_bob", NAN, "no number"),
+        ("omni", 0.1, "'omni'"),
+        ("equidistant", 0.1, "5 numbers: give 4"),
+        ("rational_polynomial", 0.1, "5 numbers: give 8 or 12 or 14"),
+    ],
 )
 def test_a_distortion_that_is_none_is_rejected(messages: Any, model: str, first: float, said: str) -> None:
     info = messages.camera_info(40, 32)
@@ -264,7 +286,7 @@ def test_an_uncalibrated_camera_needs_no_size(messages: Any) -> None:
             "the picture has 40 x 32 pixels: neither the 80 x 64 of camera_info nor the 80 x 64 of its roi",
         ),
         ({"width": 80, "height": 64, "roi": (0, 0, 20, 20)}, "nor the 20 x 20 of its roi"),
-        ({"width": 0, "height": 0, "roi": (4, 4, 20, 20)}, "neither the 0 x 0 of camera_info"),
+        ({"width": 0, "height": 0, "roi": (4, 4, 20, 20)}, "width and height in camera_info are 0"),
         ({"width": 40, "height": 32, "roi": (4, 4, 0, 0)}, r"the box \[4, 4, 4, 4\] is too small"),
         ({"width": 40, "height": 32, "roi": (30, 4, 20, 20)}, "lies outside the full image of 40 x 32"),
         ({"width": 50, "height": 40, "roi": (30, 4, 40, 32)}, "lies outside the full image of 50 x 40"),
@@ -275,6 +297,14 @@ def test_an_uncalibrated_camera_needs_no_size(messages: Any) -> None:
 def test_a_wrong_camera_info_is_rejected(messages: Any, info: dict[str, Any], said: str) -> None:
     with pytest.raises(ViewError, match=rf"^image, stamp 1\.000000000: .*{said}.*\.$"):
         view_of_pair(messages.rgb(picture()), messages.camera_info(**info))
+
+
+def test_a_strip_of_a_picture_is_refused_before_it_takes_the_memory(messages: Any) -> None:
+    """The network's crop would be a square on its longer side."""
+    strip = messages.image(bytes(3 * 10_000 * 8), 10_000, 8, "rgb8", 3 * 10_000)
+    said = r"the box \[0, 0, 10000, 8\] is too large: a side has at most 8192 pixels"
+    with pytest.raises(ViewError, match=said):
+        view_of(messages.object_view(image=strip, full=(10_000, 8), box=(0, 0, 10_000, 8)))
 
 
 def test_binning_by_one_is_none(messages: Any) -> None:
@@ -345,9 +375,9 @@ def test_cameras_are_not_mixed() -> None:
 def test_what_waits_longest_goes_when_there_is_too_much() -> None:
     pairing = Pairing(3, 1000)
     pairs(pairing, "image", *range(10))
-    assert pairing.waiting() == 3
+    assert (pairing.waiting(), pairing.images_alone) == (3, 7)
     assert len(pairs(pairing, "camera_info", *range(10))) == 3
-    assert pairing.waiting() == 0
+    assert (pairing.waiting(), pairing.images_alone) == (0, 7)
 
 
 def test_pairing_goes_on_after_time_jumped_back() -> None:

@@ -177,6 +177,19 @@ def test_the_object_seen_longest_ago_makes_room(
     assert list(scanner.statistics().scans) == ["mug", "jar"], "a bad message makes no room for itself"
 
 
+def test_an_object_whose_scan_is_full_is_seen_all_the_same(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    scanner = Scanner(circle_estimator(), ScanSettings(max_scans=2, max_views=2, keep="first"))
+    send_views(scanner, bag_messages, 1, 2, object_id="mug")
+    send_views(scanner, bag_messages, 3, object_id="can")
+    (declined,) = send_views(scanner, bag_messages, 4, object_id="mug")
+    assert (declined.accepted, declined.rejected) == (False, False)
+    assert scanner.drop_last_view().object_id == "mug"
+    send_views(scanner, bag_messages, 5, object_id="jar")
+    assert list(scanner.statistics().scans) == ["mug", "jar"]
+
+
 def test_a_rejected_message_is_counted_with_its_reason(
     messages: Any, circle_estimator: Callable[..., Any]
 ) -> None:
@@ -188,7 +201,7 @@ def test_a_rejected_message_is_counted_with_its_reason(
     assert receipt.reason.startswith("views, stamp 3.000000000: the box [0, 0, 100, 100] lies outside")
     (late,) = send_views(scanner, messages, 1.5)
     assert late.rejected
-    assert late.reason.startswith("views, stamp 1.500000000: it is 0.500 s older than the scan of 'mug'")
+    assert late.reason.startswith("views, stamp 1.500000000: it is 0.500 s older than the newest view")
     (repeated,) = send_views(scanner, messages, 2)
     assert repeated.rejected
     counts = scanner.statistics().topics["views"]
