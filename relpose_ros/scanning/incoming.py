@@ -47,9 +47,13 @@ SHORTEST_FOCAL = 0.05
 QUATERNION_TOLERANCE = 0.01
 """How far from 1 a quaternion's length may be: rounded, not garbage."""
 
-_REGION_SCALE = 1.2
+REGION_SCALE = 1.2
 """Part of the picture kept around a box, in units of its longer side: the network's crop is 1.15, and a
 margin keeps the crop's interpolation off the region's edge."""
+
+SURROUNDINGS_SCALE = 3.0
+"""The same where what stands around the object may match too: of a larger part, which is shrunk to one size,
+the object itself would show too little."""
 
 
 class ViewError(RelPoseError):
@@ -118,8 +122,13 @@ def object_id_of(message: Any, source: Source, default: str) -> str:
     return message.object_id or default
 
 
-def view_from_object_view(message: Any, source: Source) -> View:
+def view_from_object_view(message: Any, source: Source, region_scale: float = REGION_SCALE) -> View:
     """The view in a relpose_ros/ObjectView.
+
+    Args:
+        message: The view.
+        source: Where it came from.
+        region_scale: Which part of the picture is kept, in units of the box's longer side.
 
     Raises:
         ViewError: A field is wrong, or two of them contradict each other.
@@ -138,10 +147,17 @@ def view_from_object_view(message: Any, source: Source) -> View:
             if image_decoding.raw_size(mask) != picture.size:
                 text = f"the mask has {_size_text(image_decoding.raw_size(mask))} pixels"
                 raise source.rejection(f"{text}, the picture {_size_text(picture.size)}")
-        return _view(picture, origin, box, full, _intrinsics(message.k, full, source), decode_mask, source)
+        intrinsics = _intrinsics(message.k, full, source)
+        return _view(picture, origin, box, full, intrinsics, decode_mask, source, region_scale)
 
 
-def view_from_image(image: Any, info: Any, source: Source, rectification: str = "auto") -> View:
+def view_from_image(
+    image: Any,
+    info: Any,
+    source: Source,
+    rectification: str = "auto",
+    region_scale: float = REGION_SCALE,
+) -> View:
     """The view in a sensor_msgs/Image or CompressedImage and the CameraInfo of the same stamp.
 
     The box is the camera info's roi; an roi of zeros is the full image. As in image_pipeline, the picture
@@ -153,6 +169,7 @@ def view_from_image(image: Any, info: Any, source: Source, rectification: str = 
         info: Its camera info.
         source: Where and when ``image`` was taken.
         rectification: "raw", "rectified", or "auto": as the topic's name says, see `RECTIFIED_TOPIC`.
+        region_scale: As in `view_from_object_view`.
 
     Raises:
         ViewError: A field is wrong, or two of them contradict each other.
@@ -186,7 +203,8 @@ def view_from_image(image: Any, info: Any, source: Source, rectification: str = 
         else:
             intrinsics = _intrinsics(info.k, full, source)
             distortion = None if rectified or intrinsics is None else _distortion(info, source)
-        return replace(_view(picture, origin, box, full, intrinsics, None, source), distortion=distortion)
+        view = _view(picture, origin, box, full, intrinsics, None, source, region_scale)
+        return replace(view, distortion=distortion)
 
 
 def robot_pose(message: Any, source: Source, deviations: tuple[float, float]) -> RobotPose:
@@ -233,8 +251,9 @@ def _view(
     intrinsics: Intrinsics | None,
     decode_mask: Callable[[Region], npt.NDArray[np.bool_]] | None,
     source: Source,
+    region_scale: float,
 ) -> View:
-    """The view, with only that part of the picture that the network's crop needs."""
+    """The view, with only that part of the picture that is looked at."""
     if not all(0 < side <= MAX_FULL_SIDE for side in full):
         raise source.rejection(f"the full image cannot have {_size_text(full)} pixels")
     if min(box.width, box.height) < MIN_BOX_SIDE:
@@ -253,7 +272,7 @@ def _view(
         text = f"{_box_text(box)} is too large: a side has at most {MAX_BOX_SIDE} pixels"
         raise source.rejection(f"{text}; shrink the picture")
     centre_x, centre_y = (box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2
-    half = _REGION_SCALE * max(box.width, box.height) / 2
+    half = region_scale * max(box.width, box.height) / 2
     x0, y0 = max(math.floor(centre_x - half), shown[0]), max(math.floor(centre_y - half), shown[1])
     x1, y1 = min(math.ceil(centre_x + half), shown[2]), min(math.ceil(centre_y + half), shown[3])
     region = Region(x0 - origin[0], y0 - origin[1], x1 - origin[0], y1 - origin[1])

@@ -13,6 +13,8 @@ from relpose_ros.errors import RelPoseError
 from relpose_ros.estimates import Verdict
 from relpose_ros.inference.verdict import without_room
 from relpose_ros.scanning.incoming import (
+    REGION_SCALE,
+    SURROUNDINGS_SCALE,
     Arrival,
     Pairing,
     ViewError,
@@ -317,8 +319,8 @@ class Scanner:
 
     def _receive_object_view(self, topic: str, message: Any) -> Receipt:
         source = source_of(message, topic)
-        object_id = object_id_of(message, source, self._settings.object_id)
-        return self._offer(object_id, source, lambda: view_from_object_view(message, source), (topic,))
+        object_id, scale = object_id_of(message, source, self._settings.object_id), self._region_scale
+        return self._offer(object_id, source, lambda: view_from_object_view(message, source, scale), (topic,))
 
     def _receive_camera_pose(self, topic: str, message: Any) -> Receipt:
         source = source_of(message, topic)
@@ -343,6 +345,10 @@ class Scanner:
         if source is not None:
             self._topics[source.topic].used += 1
 
+    @property
+    def _region_scale(self) -> float:
+        return SURROUNDINGS_SCALE if self._settings.surroundings else REGION_SCALE
+
     def _stamps_held(self) -> set[int]:
         return set().union(*(state.buffer.stamps() for state in self._scans.values()))
 
@@ -365,11 +371,12 @@ class Scanner:
     def _offer_pair(self, pair: ImagePair) -> Receipt:
         image, info = pair.image, pair.info
         topics, rectification = (image.source.topic, info.source.topic), self._settings.rectification
+        scale = self._region_scale
         try:
             return self._offer(
                 self._settings.object_id,
                 image.source,
-                lambda: view_from_image(image.message, info.message, image.source, rectification),
+                lambda: view_from_image(image.message, info.message, image.source, rectification, scale),
                 topics,
             )
         except ViewError as err:
