@@ -177,6 +177,19 @@ def test_the_object_seen_longest_ago_makes_room(
     assert list(scanner.statistics().scans) == ["mug", "jar"], "a bad message makes no room for itself"
 
 
+def test_what_stands_around_is_kept_where_it_may_match(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    """A box of 16 pixels in a picture of 40 x 32; the node keeps no more of a picture than it looks at."""
+    scanner = Scanner(circle_estimator(), ScanSettings())
+    send_views(scanner, bag_messages, 1)
+    scanner.change_settings(ScanSettings(surroundings=True))
+    send_views(scanner, bag_messages, 2)
+    (result,) = drain(scanner)
+    assert [view.image.shape[:2] for view in result.scan.views] == [(20, 20), (32, 40)]
+    assert [view.origin for view in result.scan.views] == [(6, 6), (0, 0)]
+
+
 def test_an_object_whose_scan_is_full_is_seen_all_the_same(
     bag_messages: Any, circle_estimator: Callable[..., Any]
 ) -> None:
