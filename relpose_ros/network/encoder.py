@@ -210,11 +210,10 @@ class Encoder(nn.Module):
         Those before the descriptors' are not read; where the last ones are missing, the backbone goes on from
         the last one given.
         """
-        given, last = len(maps), maps[-1]
-        assert last is not None
-        maps = [*maps, *self.feature_extractor.later_maps(last, given - 1)]
         last = maps[-1]
         assert last is not None
+        later = self.feature_extractor.later_maps(last, len(maps) - 1)
+        maps, last = [*maps, *later], (later or [last])[-1]
         pooled = last.mean((-2, -1)) if self.layout is None else self.layout(last)
         return pooled, None if self.descriptors is None else self.descriptors(maps)
 
