@@ -80,8 +80,9 @@ class LocalFeatures:
     """A pixel of the picture in which they were found, in units of ``rays``: the scale of their accuracy."""
     guessed: bool
     """Whether the intrinsics are a guess."""
-    unbounded: bool = False
-    """Whether neither box nor mask tells the object from what stands around it, although they should."""
+    strays: bool = False
+    """Whether features of what stands around the object may be among them, although they should not: a box
+    has room for them, and no mask tells them apart."""
     outline: Outline | None = None
     """None where the box is the whole picture, which says nothing of the object, or where no rays are known
     of its corners."""
@@ -140,7 +141,7 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
     return LocalFeatures(
         *(rays[known], orientations[known], descriptors[known], places, plain, pixel),
         guessed=view.intrinsics is None,
-        unbounded=full and view.mask is None and not surroundings,
+        strays=view.mask is None and not surroundings,
         outline=None if full or not _known(corners).all() else outline,
     )
 

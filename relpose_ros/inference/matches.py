@@ -168,9 +168,9 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
     None where there are too few matches, or too few that any pose explains.
     """
     matches = match(first, second)
-    if first.unbounded and second.unbounded:
-        # Before a camera that stands still an object that turns moves, and what is around it does not. What
-        # stays where it was tells little in any other case.
+    if first.strays and second.strays:
+        # Before a camera that stands still an object that turns moves, and what is around it does not; nor
+        # does a gripper before a camera in the hand. What stays where it was tells little in any other case.
         shifts = np.linalg.norm(second.rays[matches[:, 1]] - first.rays[matches[:, 0]], axis=1)
         matches = matches[shifts > THRESHOLD * math.sqrt(first.pixel * second.pixel)]
     if len(matches) < LEAST_MATCHES:

@@ -213,13 +213,13 @@ def test_where_no_ray_is_known_of_a_pixel_nothing_is_made_of_it(textured):
     assert len(wide.rays) < len(find_features(replace(view, box=BoundingBox(5, 5, 195, 155))).rays)
 
 
-def test_a_box_or_a_mask_bounds_the_object(textured):
+def test_a_mask_alone_keeps_strays_out(textured):
     whole = BoundingBox(0, 0, 200, 160)
     view = replace(textured(0), box=whole)
-    assert find_features(view).unbounded
-    assert not find_features(view, surroundings=True).unbounded, "they are asked for"
-    assert not find_features(replace(view, box=replace(whole, x0=10))).unbounded
-    assert not find_features(replace(view, mask=np.ones(view.image.shape[:2], bool))).unbounded
+    assert find_features(view).strays
+    assert not find_features(view, surroundings=True).strays, "they are asked for"
+    assert find_features(replace(view, box=replace(whole, x0=10))).strays, "a box has corners"
+    assert not find_features(replace(view, mask=np.ones(view.image.shape[:2], bool))).strays
 
 
 def test_the_outline_is_the_box_as_the_camera_sees_it(textured):

@@ -210,16 +210,20 @@ def test_a_static_background_takes_no_part(ball_on_a_turntable, rotation_of_ball
     assert degrees(misled.poses[0].rotation, np.eye(3)) < 3
 
 
-def test_without_a_box_what_stays_in_place_says_nothing(ball_on_a_turntable, rotation_of_ball):
-    """A camera info without a region of interest: the box is the picture, and most of it does not turn."""
-    views = [ball_on_a_turntable(turn, masked=False) for turn in (0, 20)]
-    whole = BoundingBox(0, 0, views[0].full_width, views[0].full_height)
-    found = relate(*(find_features(replace(view, box=whole)) for view in views))
+@pytest.mark.parametrize("bounded", [True, False])
+def test_without_a_mask_what_stays_in_place_says_nothing(ball_on_a_turntable, rotation_of_ball, bounded):
+    """A box has corners that do not turn; without a region of interest most of the picture does not."""
+    views = [ball_on_a_turntable(turn, masked=False) for turn in (0, 20, 180)]
+    if not bounded:
+        whole = BoundingBox(0, 0, views[0].full_width, views[0].full_height)
+        views = [replace(view, box=whole) for view in views]
+    features = [find_features(view) for view in views]
+    found = relate(features[0], features[1])
     truth = rotation_of_ball(20) @ rotation_of_ball(0).T
-    assert found.probability > 0.9
-    assert degrees(found.poses[0].rotation, truth) < 3
-    same = relate(*(find_features(replace(views[0], box=whole)) for _ in range(2)))
-    assert same.probability == 0, "of a picture taken twice nobody knows whether anything moved"
+    assert found.probability > 0.5
+    assert degrees(found.poses[0].rotation, truth) < 4
+    assert relate(features[0], features[2]).probability == 0, "the other side: nothing else is in both"
+    assert relate(features[0], features[0]).probability == 0, "nobody knows whether anything moved"
 
 
 # Trust, and what becomes of it.
@@ -375,6 +379,7 @@ def test_neighbouring_photographs(shared):
 
 def test_the_same_bits_on_any_number_of_threads(textured):
     whole = textured(0, 120, 260)
+    whole = replace(whole, mask=np.ones(whole.image.shape[:2], bool))  # what stays in place is the object
     boxes = [BoundingBox(left, 0, left + 140, 120) for left in (0, 30, 60, 90)]
     threads, found = torch.get_num_threads(), []
     try:
