@@ -132,8 +132,12 @@ def refine(
     if not after < before:
         return None
     members = np.unique(chosen.camera)
-    groups = _held_together(members, here[0], geometries)
-    return Refined(*here, groups, before, after, information(here, points, chosen))
+    for adjusted, given in zip(here, (rotations, translations), strict=True):
+        # The first round may have moved a camera that the last one left out.
+        others = np.setdiff1d(np.arange(len(given)), members)
+        adjusted[others] = given[others]
+    together = _held_together(members, here[0], geometries)
+    return Refined(*here, together, before, after, information(here, points, chosen))
 
 
 def information(poses: tuple[FloatArray, FloatArray], points: FloatArray, seen: _Observations) -> FloatArray:

@@ -296,7 +296,12 @@ class Estimator:
             joint,
             pairs,
             score=float(joint_scores(found.energies, solution[None])[0]),
-            verdict=judge(pairs, apart(joint), self._calibration is not None),
+            verdict=judge(
+                pairs,
+                apart(joint),
+                self._calibration is not None,
+                guessed=any(view.intrinsics is None for view in scan.views),
+            ),
         )
 
     def _regressed(self, scan: Scan) -> _Told:

@@ -347,7 +347,7 @@ def guessed_focal_covariance(turn: FloatArray) -> FloatArray:
     Returns:
         (3, 3) rad^2.
     """
-    return (GUESSED_FOCAL_DEVIATION / 2) ** 2 * (np.outer(turn, turn) + float(turn @ turn) * np.eye(3) / 4)
+    return GUESSED_FOCAL_DEVIATION**2 * (np.outer(turn, turn) + float(turn @ turn) * np.eye(3) / 4)
 
 
 def _widened(pose: RelativePose) -> RelativePose:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from relpose_ros.estimates import Verdict
+from relpose_ros.estimates import Evidence, Verdict
+from relpose_ros.geometry import so3
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,6 +27,8 @@ CONTRADICTION_ANGLE = math.radians(10)
 """From this angle on between a pair's own rotation and the final poses' the two disagree."""
 LARGEST_ROTATION_DEVIATION = math.radians(12)
 """Largest standard deviation (worst axis) of a camera's rotation: within 15 degrees more often than not."""
+SAME_PLACE = math.radians(3)
+"""Two views of a trusted pair that is turned by less are one: a picture taken twice repeats its mistakes."""
 ONE_MORE = "one more view: "
 NOT_ENOUGH = "not enough: "
 WITHOUT_ROOM = {
@@ -36,6 +39,12 @@ WITHOUT_ROOM = {
 }
 """What to do where no more views are held, by the scan's policy of which ones stay."""
 
+GUESSED = (
+    "the camera's focal length is a guess, and with a wrong one all turns are wrong in proportion: send the "
+    "intrinsics, in camera_info or as k"
+)
+"""What is missing where no view said how it was taken, in words."""
+
 WITHOUT_PROBABILITIES = (
     f"{NOT_ENOUGH}this network regresses poses and cannot say how far to trust them, so that none of its "
     "estimates can be called enough"
@@ -44,20 +53,27 @@ WITHOUT_PROBABILITIES = (
 
 
 def judge(
-    pairs: Sequence[PairRotation], covariances: npt.NDArray[np.float64], calibrated: bool
+    pairs: Sequence[PairRotation],
+    covariances: npt.NDArray[np.float64],
+    calibrated: bool,
+    *,
+    guessed: bool = False,
 ) -> tuple[Verdict, int, str]:
     """The verdict, the weakest pair's position and the verdict in words.
 
-    ENOUGH asks for four things: a trusted chain of pairs from every camera to the first; that no camera and
-    no group of them hangs on a single pair, which nothing checks, so that two views are never enough; a small
-    covariance of every camera's rotation; and calibrated probabilities, without which the others mean
-    nothing. Of positions it asks nothing: their covariances say what is known. Views are named by their
-    position in the scan, from 0, as in the messages.
+    ENOUGH asks for five things: a trusted chain of pairs from every camera to the first; that no camera and
+    no group of them hangs on a single pair, which nothing checks, so that two views are never enough, however
+    often each was taken; a small covariance of every camera's rotation; calibrated probabilities, without
+    which the others mean nothing; and a known focal length where matches are among what it rests on, since
+    with a wrong one all turns are wrong together, by a fifth of them or more. Of positions it asks nothing:
+    their covariances say what is known. Views are named by their position in the scan, from 0, as in the
+    messages.
 
     Args:
         pairs: of all N views.
         covariances: (N, 6, 6) of the cameras.
         calibrated: whether the probabilities were calibrated.
+        guessed: whether a view's focal length is a guess.
     """
     deviations = rotation_deviations(covariances)
     tied = _tied(pairs, len(covariances))
@@ -70,6 +86,8 @@ def judge(
         return Verdict.ONE_MORE_VIEW, bridge, f"{ONE_MORE}{reason}"
     if all(tied) and deviations.max() <= LARGEST_ROTATION_DEVIATION:
         weakest = min(range(len(pairs)), key=lambda p: _certainty(pairs[p]))
+        if guessed and any(Evidence.GEOMETRIC in pairs[p].evidence for p in trusted):
+            return Verdict.ONE_MORE_VIEW, weakest, f"{NOT_ENOUGH}{GUESSED}"
         if calibrated:
             worst = math.degrees(deviations.max())
             return (
@@ -144,17 +162,24 @@ def _chains(pairs: Sequence[PairRotation], views: int) -> list[list[int]]:
 def _unchecked(pairs: Sequence[PairRotation], trusted: Sequence[int]) -> tuple[int, list[int]] | None:
     """A trusted pair without which the trusted ones tie not all views together, and the views of its far end.
 
-    The least certain of such pairs. Its far end is the smaller one; of two as large, the one without view 0.
+    Pairs between the same two places are one. The least certain of such pairs. Its far end is the smaller
+    one; of two as large, the one without view 0.
     """
+    repeated = [pairs[p] for p in trusted if _turn(pairs[p]) < SAME_PLACE]
+    places = [frozenset(min(_reached(view, repeated)) for view in (pairs[p].i, pairs[p].j)) for p in trusted]
     found = []
-    for bridge in trusted:
-        others = [pairs[p] for p in trusted if p != bridge]
+    for bridge, ends in zip(trusted, places, strict=True):
+        others = [pairs[p] for p, between in zip(trusted, places, strict=True) if between != ends]
         near = _reached(pairs[bridge].i, others)
         if pairs[bridge].j not in near:
             far = _reached(pairs[bridge].j, others)
             views = min(near, far, key=lambda each: (len(each), 0 in each))
             found.append((_certainty(pairs[bridge]), bridge, sorted(views)))
     return min(found)[1:] if found else None
+
+
+def _turn(pair: PairRotation) -> float:
+    return float(so3.angle_between(pair.camera_j_from_camera_i, np.eye(3)))
 
 
 def _reached(view: int, pairs: Sequence[PairRotation]) -> set[int]:

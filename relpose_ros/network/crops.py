@@ -62,7 +62,7 @@ def crop_view(
         image_size = f"{view.full_width} x {view.full_height}"
         raise CropError(f"The box {_words(view.box)} is far larger than its image of {image_size}.")
     pixels = _cut(view, left, top, side)
-    image = torch.from_numpy(pixels).permute(2, 0, 1)[None].float() / 255
+    image = torch.from_numpy(pixels).permute(2, 0, 1)[None].float().div_(255)
     size = (preset.image_size, preset.image_size)
     antialias = preset.crop_antialias and side > preset.image_size
     image = functional.interpolate(image, size, mode="bilinear", align_corners=False, antialias=antialias)
