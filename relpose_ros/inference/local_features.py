@@ -214,8 +214,16 @@ def _straightened(rays: FloatArray, distortion: Distortion | None) -> FloatArray
 
     if distortion is None or len(rays) == 0:
         return rays
-    undo: Any = cv2.fisheye.undistortPoints if distortion.equidistant else cv2.undistortPoints
-    return np.asarray(undo(rays[:, None], np.eye(3), np.array(distortion.coefficients))[:, 0], np.float64)
+    bent, coefficients = rays[:, None], np.array(distortion.coefficients)
+    if distortion.equidistant:
+        straight: Any = cv2.fisheye.undistortPoints(bent, np.eye(3), coefficients)
+    else:
+        # Five iterations, the default, leave pixels of error in the corners of a wide picture. OpenCV 4 lets
+        # a function of another name have more.
+        undo: Any = vars(cv2).get("undistortPointsIter", cv2.undistortPoints)
+        criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
+        straight = undo(bent, np.eye(3), coefficients, R=None, P=None, criteria=criteria)
+    return np.asarray(straight[:, 0], np.float64)
 
 
 def _known(rays: FloatArray) -> npt.NDArray[np.bool_]:

@@ -296,6 +296,31 @@ def test_a_pair_that_nothing_checks_is_not_enough(fisher_scene, cameras_around):
     assert judge(pairs, covariances, calibrated=True)[0] is Verdict.ONE_MORE_VIEW
 
 
+def test_a_picture_taken_twice_checks_nothing(fisher_scene, cameras_around):
+    """Views 0 and 1 are of one place, and so are 2 and 3: all else rests on what is one pair of pictures."""
+    two = cameras_around(2, 8)
+    twice = two[[0, 0, 1, 1]]
+    twice[1] = so3.exp([0.01, 0.0, 0.01]) @ twice[1]
+    pairs, covariances, _ = told(fisher_scene(twice, concentration=300.0))
+    verdict, weakest, words = judge(pairs, covariances, calibrated=True)
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert {pairs[weakest].i, pairs[weakest].j} & {0, 1}
+    assert {pairs[weakest].i, pairs[weakest].j} & {2, 3}
+    assert "which no other pair checks" in words
+    three = cameras_around(3, 8)[[0, 0, 1, 2]]
+    assert judge(*told(fisher_scene(three, concentration=300.0))[:2], True)[0] is Verdict.ENOUGH
+
+
+def test_with_a_guessed_focal_length_matches_are_not_enough(fisher_scene, cameras_around):
+    pairs, covariances, _ = told(fisher_scene(cameras_around(3, 6), concentration=150.0))
+    assert judge(pairs, covariances, True, guessed=True)[0] is Verdict.ENOUGH, "the network needs none"
+    matched = [replace(pair, evidence=Evidence.LEARNED | Evidence.GEOMETRIC) for pair in pairs]
+    assert judge(matched, covariances, True)[0] is Verdict.ENOUGH
+    verdict, _, words = judge(matched, covariances, True, guessed=True)
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert words.startswith("not enough: the camera's focal length is a guess")
+
+
 def test_two_groups_that_one_pair_ties_are_not_enough(fisher_scene, cameras_around):
     """Every view has two sure pairs, and yet half of them may be turned by what the one pair is wrong by."""
     scene = fisher_scene(cameras_around(6, 8), concentration=300.0)
