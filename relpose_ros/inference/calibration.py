@@ -57,9 +57,9 @@ class Calibration:
     """Factor on the covariance of a camera's rotation."""
     translation_sigma: tuple[float, float, float] = (0.1, 0.1, 0.2)
     """Standard deviation of a predicted translation in the camera's axes, in units of the first camera's
-    distance. The defaults are cautious: across the view a network can read the object's place off its box, its
-    depth off the box's size alone. What was fitted holds for objects as far from the middle of the picture as
-    those it was fitted on."""
+    distance. The defaults are cautious: across the view a network can read the object's place off its box,
+    its depth off the box's size alone. What was fitted holds for objects as far from the middle of the
+    picture as those it was fitted on."""
     flat: float = 0.0
     """Share of the uniform distribution that is mixed in: how often the network is plainly wrong of a pair,
     as on photographs unlike its training images. Without it such a pair outvotes all else that is known."""

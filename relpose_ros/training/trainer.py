@@ -403,7 +403,8 @@ class Trainer:
             }
             # In the full precision in which it looks, where the file has half of it.
             same = {name: value for name, value in own.items() if value.half().equal(state[name].half())}
-            if len(same) < len(own) and self._scans.map_shapes and not self.settings.backbone_rate:
+            kept = any(each is not None and each.map_shapes for each in (self._scans, self._held_out))
+            if len(same) < len(own) and kept and not self.settings.backbone_rate:
                 text = (
                     f"the backbone of {weights} was trained, and the shards hold what it saw before; "
                     "train it further (--backbone-rate), or give it shards of images."

@@ -236,6 +236,8 @@ def test_where_a_backbone_was_trained_is_not_forgotten(shards, frozen, tiny_pres
         Trainer(frozen, tmp_path / "run", features)
     with pytest.raises(TrainingError, match="was trained, and the shards hold what it saw before"):
         Trainer(frozen, tmp_path / "begun", features, start_from=weights)
+    with pytest.raises(TrainingError, match="was trained, and the shards hold what it saw before"):
+        Trainer(frozen, tmp_path / "begun", open_scans([shards]), features, start_from=weights)
     assert Trainer(frozen, tmp_path / "begun", open_scans([shards]), start_from=weights).images == run.images
     monkeypatch.setitem(PRESETS, "tiny", tiny_preset)
     with pytest.raises(TrainingError, match="'tiny' has no pretrained layers behind what it reads"):
