@@ -40,8 +40,6 @@ THRESHOLD = 1.5
 """Of an inlier, in pixels of the picture in which the features were found."""
 REACH = 4.0
 """Pixels: matches that may obey a rival of the pose that was found, if not that one."""
-SHAKE = 16.0
-"""Pixels by which a camera that is meant to stand still may move its picture from one view to another."""
 LEAST_MATCHES = 16
 """Fewer are not trusted (see `trust`), whatever they say."""
 TURN = math.radians(30)
@@ -171,8 +169,10 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
     """
     matches = match(first, second)
     if first.strays and second.strays:
-        shifts = second.rays[matches[:, 1]] - first.rays[matches[:, 0]]
-        matches = matches[_moves(shifts / math.sqrt(first.pixel * second.pixel))]
+        # Before a camera that stands still an object that turns moves, and what is around it does not; nor
+        # does a gripper before a camera in the hand. What stays where it was tells little in any other case.
+        shifts = np.linalg.norm(second.rays[matches[:, 1]] - first.rays[matches[:, 0]], axis=1)
+        matches = matches[shifts > THRESHOLD * math.sqrt(first.pixel * second.pixel)]
     if len(matches) < LEAST_MATCHES:
         return None
     # Of one object seen twice they do (weak geometric consistency: Jegou et al. 2008).
@@ -209,25 +209,6 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
         np.stack([first.places[inliers[:, 0]], second.places[inliers[:, 1]]], 1),
         Support(len(inliers), float(distances[inside].mean()) / pixel, spread),
     )
-
-
-def _moves(shifts: FloatArray) -> npt.NDArray[np.bool_]:
-    """Which matches do not stay where they were in the picture. (M, 2) pixels -> (M,).
-
-    Before a camera that stands still an object that turns moves, and what is around it does not; nor does a
-    gripper before a camera in the hand. A camera that shakes shifts all of it alike: what goes with the
-    commonest of the small shifts stays too. It tells little in any other case.
-    """
-    from scipy.spatial import cKDTree
-
-    lengths = np.linalg.norm(shifts, axis=1)
-    stays = lengths < THRESHOLD
-    small = np.flatnonzero(lengths < SHAKE)
-    if len(small):
-        tree = cKDTree(shifts[small])
-        alike = tree.query_ball_point(shifts[small], 2 * THRESHOLD)
-        stays[small[max(alike, key=len)]] = True
-    return np.asarray(~stays)
 
 
 def trust(support: Support) -> float:
