@@ -66,7 +66,10 @@ def test_a_clock_that_jumps_back_resets_the_scans(
     assert new_graph.diagnostic("failed estimates") == "1"
     assert new_graph.diagnostic("mug views") == "2"
     answer = new_graph.trigger("estimate_now")
-    assert (answer.success, answer.message) == (False, "The estimate failed.")
+    assert (answer.success, answer.message) == (
+        False,
+        "The estimate of 'mug' from 2 views failed: this estimator cannot estimate.",
+    )
     assert "cannot estimate" in new_graph.diagnostics().message
     new_graph.set_clock(50)
     node.wait_for("the clock jumped backwards by 50.000 s")
