@@ -132,10 +132,9 @@ def refine(
     if not after < before:
         return None
     members = np.unique(chosen.camera)
-    for adjusted, given in zip(here, (rotations, translations), strict=True):
-        # The first round may have moved a camera that the last one left out.
-        others = np.setdiff1d(np.arange(len(given)), members)
-        adjusted[others] = given[others]
+    # The first round may have moved a camera that the last one left out.
+    others = np.setdiff1d(np.arange(len(rotations)), members)
+    here[0][others], here[1][others] = rotations[others], translations[others]
     together = _held_together(members, here[0], geometries)
     return Refined(*here, together, before, after, information(here, points, chosen))
 

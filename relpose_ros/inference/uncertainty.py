@@ -300,8 +300,10 @@ def _independence(energies: PairEnergies, sure: torch.Tensor) -> FloatArray:
     together see the same side: what the network mistakes in one it mistakes in the others. Between two such
     groups the mean of the pairs counts, as if each group were one view.
     """
-    i, j = energies.i.numpy(), energies.j.numpy()
     tied = sure.numpy()
+    if not tied.any():  # the network alone does without SciPy
+        return np.full(energies.count, 2 / energies.views)
+    i, j = energies.i.numpy(), energies.j.numpy()
     group = groups(i[tied], j[tied], energies.views)
     sizes = np.bincount(group)
     within = group[i] == group[j]

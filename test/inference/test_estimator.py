@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import gc
 import math
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 
@@ -573,3 +575,19 @@ def test_no_number_of_threads_is_torchs_own():
         assert torch.get_num_threads() == OWN_THREADS
     finally:
         torch.set_num_threads(before)
+
+
+def test_the_network_alone_does_without_opencv_and_scipy():
+    program = """
+import sys
+sys.modules["cv2"] = sys.modules["scipy"] = None
+import numpy as np
+from relpose_ros.inference.estimator import Estimator, EvidenceSettings
+from relpose_ros.views import BoundingBox, Scan, View
+pictures = np.random.default_rng(0).integers(0, 256, (3, 40, 60, 3), dtype=np.uint8)
+views = tuple(View(each, BoundingBox(10, 5, 50, 35), 60, 40) for each in pictures)
+estimator = Estimator.from_weights(evidence=EvidenceSettings(use="network"))
+print(len(estimator.estimate(Scan("x", views)).cameras))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.stdout == "3\n", done.stderr

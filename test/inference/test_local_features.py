@@ -173,22 +173,21 @@ def test_without_intrinsics_the_focal_length_is_guessed(textured):
     np.testing.assert_allclose(known.rays, features.rays)
 
 
+def bent_by_a_polynomial(rays, coefficients):
+    points = np.concatenate([rays, np.ones((len(rays), 1))], 1)[:, None]
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), coefficients)[0]
+
+
 @pytest.mark.parametrize(
     ("distortion", "bend"),
     [
         (
             Distortion((-0.3, 0.1, 0.002, -0.001, 0.0)),
-            lambda rays, d: cv2.projectPoints(
-                np.concatenate([rays, np.ones((len(rays), 1))], 1)[:, None],
-                *(np.zeros(3), np.zeros(3), np.eye(3), d),
-            )[0],
+            bent_by_a_polynomial,
         ),
         (
             Distortion((-0.38, 0.14, 0.0, 0.0)),
-            lambda rays, d: cv2.projectPoints(
-                np.concatenate([rays, np.ones((len(rays), 1))], 1)[:, None],
-                *(np.zeros(3), np.zeros(3), np.eye(3), d),
-            )[0],
+            bent_by_a_polynomial,
         ),
         (
             Distortion((0.1, -0.02, 0.003, 0.0), equidistant=True),

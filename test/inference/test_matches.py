@@ -210,8 +210,10 @@ def test_a_static_background_takes_no_part(ball_on_a_turntable, rotation_of_ball
     assert degrees(misled.poses[0].rotation, np.eye(3)) < 3
 
 
-@pytest.mark.parametrize("bounded", [True, False])
-def test_without_a_mask_what_stays_in_place_says_nothing(ball_on_a_turntable, rotation_of_ball, bounded):
+@pytest.mark.parametrize(("bounded", "least", "most"), [(True, 0.5, 4), (False, 0.9, 3)])
+def test_without_a_mask_what_stays_in_place_says_nothing(
+    ball_on_a_turntable, rotation_of_ball, bounded, least, most
+):
     """A box has corners that do not turn; without a region of interest most of the picture does not."""
     views = [ball_on_a_turntable(turn, masked=False) for turn in (0, 20, 180)]
     if not bounded:
@@ -220,10 +222,12 @@ def test_without_a_mask_what_stays_in_place_says_nothing(ball_on_a_turntable, ro
     features = [find_features(view) for view in views]
     found = relate(features[0], features[1])
     truth = rotation_of_ball(20) @ rotation_of_ball(0).T
-    assert found.probability > 0.5
-    assert degrees(found.poses[0].rotation, truth) < 4
+    assert found.probability > least
+    assert degrees(found.poses[0].rotation, truth) < most
     assert relate(features[0], features[2]).probability == 0, "the other side: nothing else is in both"
-    assert relate(features[0], features[0]).probability == 0, "nobody knows whether anything moved"
+    assert relate(features[0], features[0]).probability == 0, (
+        "of a picture taken twice nobody knows whether anything moved"
+    )
 
 
 # Trust, and what becomes of it.
