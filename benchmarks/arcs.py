@@ -75,11 +75,12 @@ def main() -> None:
         for views in arguments.views:
             measured = []
             for arc in tqdm(arcs(poses[:, :, :3], views), desc=f"{capture.name}, N = {views}", leave=False):
-                found = method.poses([held[k] for k in arc])
+                scan = [held[k] for k in arc]
+                found = method.poses(scan)
                 assert found.estimate is not None
                 rotations, translations = poses[arc, :, :3], poses[arc, :, 3]
                 errors = metrics.rotation_errors(found.rotations, rotations)
-                measured.append((errors, trust.statements(found.estimate, rotations, translations)))
+                measured.append((errors, trust.statements(found.estimate, scan, rotations, translations)))
             show(capture.name, views, measured)
             totals[views] += measured
     for views, measured in totals.items():

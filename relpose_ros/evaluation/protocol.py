@@ -220,7 +220,7 @@ def _scans(
                         metrics.rotation_errors(poses.rotations, true_r),
                         metrics.center_errors(poses.rotations, poses.translations, true_r, true_t, scale),
                         metrics.translation_errors(poses.rotations, poses.translations, true_t, scale),
-                        None if estimate is None else trust.statements(estimate, true_r, true_t),
+                        None if estimate is None else trust.statements(estimate, given, true_r, true_t),
                         seconds[source],
                     )
                 )

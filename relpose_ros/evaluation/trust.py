@@ -15,6 +15,7 @@ from relpose_ros.inference.calibration import (
     expected_calibration_error,
     mahalanobis_square,
 )
+from relpose_ros.inference.outlines import find_outline, sightlines
 from relpose_ros.inference.uncertainty import WITHIN
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from relpose_ros.estimates import ScanEstimate
+    from relpose_ros.views import View
 
     FloatArray = npt.NDArray[np.float64]
 
@@ -66,18 +68,23 @@ class Statements:
 
 
 def statements(
-    estimate: ScanEstimate, true_rotations: FloatArray, true_translations: FloatArray
+    estimate: ScanEstimate,
+    views: Sequence[View],
+    true_rotations: FloatArray,
+    true_translations: FloatArray,
 ) -> Statements:
     """Holds an estimate's statements against the truth.
 
     Args:
-        estimate: of N views, its unit of length the first camera's distance.
+        estimate: its unit of length the first camera's distance.
+        views: the N views it was made of, whose boxes say where the origin of its frame is.
         true_rotations: (N, 3, 3) camera_from_world, any world.
         true_translations: (N, 3), any unit.
     """
-    about_look_at, _, _ = cameras.look_at_translations(true_rotations, true_translations)
+    seen = sightlines([find_outline(view) for view in views])
+    about_object, _, _ = cameras.look_at_translations(true_rotations, true_translations, seen)
     truth = true_rotations @ true_rotations[0].T  # camera_from_object, axes of the first camera
-    true_centres = cameras.camera_centre(truth, about_look_at)
+    true_centres = cameras.camera_centre(truth, about_object)
     pair_squares, right, final = [], [], []
     for pair in estimate.pairs:
         true = truth[pair.j] @ truth[pair.i].T

@@ -26,14 +26,19 @@ def homogeneous(rays: npt.ArrayLike) -> FloatArray:
 
 def camera_centre(camera_from_world: npt.ArrayLike, translation: npt.ArrayLike) -> FloatArray:
     """Where the camera stands in the world: ``-R^T t``. (..., 3, 3), (..., 3) -> (..., 3)."""
-    r, t = np.asarray(camera_from_world, np.float64), np.asarray(translation, np.float64)
-    return np.asarray(-np.einsum("...ji,...j->...i", r, t))
+    return -in_world(camera_from_world, translation)
 
 
 def translation_of(camera_from_world: npt.ArrayLike, centre: npt.ArrayLike) -> FloatArray:
     """The translation of a camera that stands at ``centre``: ``-R c``. (..., 3, 3), (..., 3) -> (..., 3)."""
     r, c = np.asarray(camera_from_world, np.float64), np.asarray(centre, np.float64)
     return np.asarray(-np.einsum("...ij,...j->...i", r, c))
+
+
+def in_world(camera_from_world: npt.ArrayLike, directions: npt.ArrayLike) -> FloatArray:
+    """Directions in the cameras' axes as the world has them: ``R^T d``. (..., 3, 3), (..., 3) -> (..., 3)."""
+    r, d = np.asarray(camera_from_world, np.float64), np.asarray(directions, np.float64)
+    return np.asarray(np.einsum("...ji,...j->...i", r, d))
 
 
 def look_at(centre: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
@@ -70,25 +75,31 @@ def project_points(
     return np.stack([u, v], -1)
 
 
-def closest_point_to_axes(camera_from_world: npt.ArrayLike, centres: npt.ArrayLike) -> FloatArray:
-    """The world point with the least summed squared distance to all optical axes (RelPose++, section 3.3).
+def closest_point_to_rays(directions: npt.ArrayLike, centres: npt.ArrayLike) -> FloatArray:
+    """The point with the least summed squared distance to the lines through the camera centres.
 
-    (..., N, 3, 3) and (..., N, 3) -> (..., 3). Parallel axes leave it free along themselves: there the answer
-    is the point nearest to the mean of the camera centres.
+    Unit directions (..., N, 3) in the world and centres (..., N, 3) -> (..., 3). Parallel lines leave it free
+    along themselves: there the answer is the point nearest to the mean of the camera centres.
     """
-    axes = np.asarray(camera_from_world, np.float64)[..., 2, :]
-    c = np.asarray(centres, np.float64)
+    rays, c = np.asarray(directions, np.float64), np.asarray(centres, np.float64)
     middle = c.mean(-2)
-    across = np.eye(3) - axes[..., :, None] * axes[..., None, :]  # keeps what is perpendicular to the axis
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]  # keeps what is perpendicular to the ray
     wanted = (across @ (c - middle[..., None, :])[..., None]).sum(-3)
     offset = np.linalg.pinv(across.sum(-3), rcond=1e-9, hermitian=True) @ wanted
     return np.asarray(middle + offset[..., 0])
 
 
+def closest_point_to_axes(camera_from_world: npt.ArrayLike, centres: npt.ArrayLike) -> FloatArray:
+    """The point closest to all optical axes (RelPose++, 3.3). (..., N, 3, 3), (..., N, 3) -> (..., 3)."""
+    return closest_point_to_rays(np.asarray(camera_from_world, np.float64)[..., 2, :], centres)
+
+
 def look_at_translations(
-    camera_from_world: npt.ArrayLike, translations: npt.ArrayLike
+    camera_from_world: npt.ArrayLike,
+    translations: npt.ArrayLike,
+    sightlines: npt.ArrayLike = (0.0, 0.0, 1.0),
 ) -> tuple[FloatArray, FloatArray, float]:
-    """What the network learns to predict: translations about the look-at point, first camera at distance 1.
+    """Translations about the look-at point, first camera at distance 1: what the network learns to predict.
 
     With ``x = x' + c`` and c the point closest to all axes, ``R x + t = R x' + (t + R c)``: the origin
     moves to c by adding R c (RelPose++ prints a minus).
@@ -96,12 +107,15 @@ def look_at_translations(
     Args:
         camera_from_world: (N, 3, 3).
         translations: (N, 3), any unit.
+        sightlines: (N, 3) unit vectors in the cameras' axes, along which each looks at the point; the
+            optical axes, as in training, where they are left out.
 
     Returns:
         (N, 3) ``s (t_i + R_i c)``, the point c (3,) in the old world, and s, with ``|t_1| = 1``.
     """
     r, t = np.asarray(camera_from_world, np.float64), np.asarray(translations, np.float64)
-    point = closest_point_to_axes(r, camera_centre(r, t))
+    rays = in_world(r, np.broadcast_to(np.asarray(sightlines, np.float64), t.shape))
+    point = closest_point_to_rays(rays, camera_centre(r, t))
     moved = t + r @ point
     scale = 1 / float(np.linalg.norm(moved[0]))
     return moved * scale, point, scale

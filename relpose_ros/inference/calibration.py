@@ -16,8 +16,10 @@ import torch
 
 from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.global_rotations import solve
+from relpose_ros.inference.outlines import sighted_translations, sightlines
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import PairEnergies
+from relpose_ros.inference.predictions import about_the_object
 from relpose_ros.inference.uncertainty import WITHIN, camera_covariances, describe_pairs
 
 if TYPE_CHECKING:
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 
     from relpose_ros.estimates import PairRotation
     from relpose_ros.inference.global_rotations import JointSolutions
+    from relpose_ros.inference.outlines import Outline
     from relpose_ros.inference.pair_distribution import PairDistributions
     from relpose_ros.inference.pair_energies import EnergyModel, GridEmbeddings
 
@@ -55,11 +58,12 @@ class Calibration:
     """Factor on the covariance of a pair's relative rotation."""
     rotation_spread: float = 1.0
     """Factor on the covariance of a camera's rotation."""
-    translation_sigma: tuple[float, float, float] = (0.1, 0.1, 0.2)
-    """Standard deviation of a predicted translation in the camera's axes, in units of the first camera's
-    distance. The defaults are cautious: across the view a network can read the object's place off its box,
-    its depth off the box's size alone. What was fitted holds for objects as far from the middle of the
-    picture as those it was fitted on."""
+    placed_by_boxes: bool = False
+    """Whether the boxes tell where cameras stand from the object (`outlines.sighted_translations`) better
+    than the network's predicted translations do."""
+    position_sigma: tuple[float, float] = (0.1, 0.2)
+    """Standard deviations of where a camera stands from the object, across its line of sight and along it, in
+    units of the first camera's distance, before matches tell more. The defaults are cautious."""
     flat: float = 0.0
     """Share of the uniform distribution that is mixed in: how often the network is plainly wrong of a pair,
     as on photographs unlike its training images. Without it such a pair outvotes all else that is known."""
@@ -73,8 +77,8 @@ class Calibration:
         """Reads what `to_json` wrote; other keys (a report kept beside it) are passed over."""
         stored = json.loads(text)
         known = {field.name: stored[field.name] for field in fields(cls) if field.name in stored}
-        if "translation_sigma" in known:
-            known["translation_sigma"] = tuple(float(sigma) for sigma in known["translation_sigma"])
+        if "position_sigma" in known:
+            known["position_sigma"] = tuple(float(sigma) for sigma in known["position_sigma"])
         return cls(**known)
 
 
@@ -85,14 +89,20 @@ class Observation:
     energies: PairEnergies
     distributions: PairDistributions
     solutions: JointSolutions
-    translations: FloatArray
-    """(N, 3) predicted, camera_from_object, the first at distance 1."""
+    predicted: FloatArray
+    """(N, 3) translations camera_from_object by the network, the first at distance 1."""
+    sighted: FloatArray
+    """(N, 3) the same by the boxes."""
     true_rotations: FloatArray
     """(N, 3, 3) camera_from_object, the first the identity."""
     true_translations: FloatArray
     """(N, 3), the first at distance 1."""
     energy_at_truth: torch.Tensor
     """(P,) float64."""
+
+    def translations(self, calibration: Calibration) -> FloatArray:
+        """(N, 3) what a calibration goes by."""
+        return self.sighted if calibration.placed_by_boxes else self.predicted
 
 
 @dataclass(frozen=True)
@@ -117,6 +127,7 @@ def observe(
     grid: GridEmbeddings,
     features: Any,
     translations: FloatArray,
+    outlines: Sequence[Outline | None],
     true_rotations: FloatArray,
     true_translations: FloatArray,
 ) -> Observation:
@@ -126,11 +137,13 @@ def observe(
         model: the network.
         grid: its embeddings of the rotation grid, shared by all scans.
         features: of the scan's N views.
-        translations: (N, 3) predicted, camera_from_object, optical.
+        translations: (N, 3) predicted, camera_from_object, optical, about where the optical axes meet.
+        outlines: where the cameras see the object.
         true_rotations: (N, 3, 3) camera_from_object in any object frame.
         true_translations: (N, 3) in the same frame, any unit.
     """
-    about_look_at, _, _ = cameras.look_at_translations(true_rotations, true_translations)
+    seen = sightlines(outlines)
+    about_object, _, _ = cameras.look_at_translations(true_rotations, true_translations, seen)
     rotations = true_rotations @ true_rotations[0].T
     with torch.no_grad():
         energies = PairEnergies.of(model, features, len(rotations))
@@ -139,8 +152,11 @@ def observe(
         relative = truth[energies.j] @ truth[energies.i].mT
         at_truth = energies.at(torch.arange(energies.count), relative[:, None])[:, 0].double()
         solutions = solve(energies, distributions)
-    predicted = translations / max(float(np.linalg.norm(translations[0])), 1e-6)
-    return Observation(energies, distributions, solutions, predicted, rotations, about_look_at, at_truth)
+    predicted = about_the_object(rotations, translations, seen)
+    sighted = sighted_translations(outlines)
+    return Observation(
+        energies, distributions, solutions, predicted, sighted, rotations, about_object, at_truth
+    )
 
 
 def log_likelihood(observations: Sequence[Observation], temperature: float, flat: float) -> float:
@@ -166,7 +182,11 @@ def _mean_log(densities: torch.Tensor, flat: float) -> float:
     return float(((1 - flat) * densities + flat).clamp_min(1e-30).log().mean())
 
 
-def fit_calibration(observations: Sequence[Observation], least_flat: float = 0.0) -> Calibration:
+def fit_calibration(
+    observations: Sequence[Observation],
+    least_flat: float = 0.0,
+    least_sigma: tuple[float, float] = (1e-3, 1e-3),
+) -> Calibration:
     """The temperature with the highest likelihood of the truth, then factors that make 90% ellipsoids hold.
 
     A factor is kept only where it brings the coverages at 50, 90 and 95% nearer to their names.
@@ -174,6 +194,7 @@ def fit_calibration(observations: Sequence[Observation], least_flat: float = 0.0
     Args:
         observations: Held-out scans.
         least_flat: Of the shares of the uniform distribution, the least that may be.
+        least_sigma: Of the standard deviations of positions, likewise.
     """
     shares = [share for share in FLAT_SHARES if share >= least_flat]
 
@@ -183,7 +204,12 @@ def fit_calibration(observations: Sequence[Observation], least_flat: float = 0.0
 
     temperature = _maximise(lambda t: best(t)[0], *TEMPERATURES)
     flat = best(temperature)[1]
-    calibration = Calibration(temperature, translation_sigma=_translation_sigma(observations), flat=flat)
+    by_network, by_boxes = (
+        _position_sigma(observations, Calibration(placed_by_boxes=by)) for by in (False, True)
+    )
+    by = _volume(by_boxes) < _volume(by_network)
+    across, along = np.maximum(by_boxes if by else by_network, least_sigma).tolist()
+    calibration = Calibration(temperature, placed_by_boxes=by, position_sigma=(across, along), flat=flat)
     pair_squares, rotation_squares, _ = _mahalanobis_squares(observations, calibration)
     return replace(calibration, pair_spread=_spread(pair_squares), rotation_spread=_spread(rotation_squares))
 
@@ -240,16 +266,17 @@ def _mahalanobis_squares(
             of_pairs.append(
                 mahalanobis_square(so3.log(truth @ pair.camera_j_from_camera_i.T), pair.covariance)
             )
+        translations = observation.translations(calibration)
         with torch.no_grad():
             covariances = camera_covariances(
                 observation.distributions,
                 observation.energies,
                 observation.solutions.rotations[0],
-                observation.translations,
+                translations,
                 calibration,
             )
         rotations = observation.solutions.rotations[0].numpy()
-        centres = cameras.camera_centre(rotations, observation.translations)
+        centres = cameras.camera_centre(rotations, translations)
         true_centres = cameras.camera_centre(observation.true_rotations, observation.true_translations)
         for camera in range(1, len(rotations)):
             turn = so3.log(observation.true_rotations[camera].T @ rotations[camera])  # axes of the object
@@ -278,11 +305,24 @@ def _spread(squares: FloatArray) -> float:
     return factor if miss(coverage(squares / factor)) < miss(coverage(squares)) else 1.0
 
 
-def _translation_sigma(observations: Sequence[Observation]) -> tuple[float, float, float]:
-    """From the 90% quantile of each axis: a few gross errors should not widen every stated position."""
-    errors = np.concatenate([np.abs(o.translations - o.true_translations) for o in observations])
-    x, y, z = np.maximum(np.quantile(errors, 0.9, axis=0) / 1.645, 1e-3)
-    return float(x), float(y), float(z)
+def _position_sigma(observations: Sequence[Observation], calibration: Calibration) -> tuple[float, float]:
+    """From 90% quantiles across and along the line of sight: a few gross errors should not widen all."""
+    across, along = [], []
+    for each in observations:
+        translations = each.translations(calibration)
+        errors = translations - each.true_translations
+        rays = translations / np.linalg.norm(translations, axis=1, keepdims=True)
+        ahead = (errors * rays).sum(1)
+        across.append(np.linalg.norm(errors - ahead[:, None] * rays, axis=1))
+        along.append(np.abs(ahead))
+    # In a plane the 90% quantile of the distance is 2.146 standard deviations, on a line 1.645.
+    quantiles = [float(np.quantile(np.concatenate(parts), 0.9)) for parts in (across, along)]
+    return quantiles[0] / 2.146, quantiles[1] / 1.645
+
+
+def _volume(sigma: tuple[float, float]) -> float:
+    """Of the ellipsoid of positions, up to a factor."""
+    return sigma[0] ** 2 * sigma[1]
 
 
 def _maximise(height: Callable[[float], float], low: float, high: float) -> float:

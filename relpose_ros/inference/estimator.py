@@ -22,9 +22,14 @@ from relpose_ros.inference.camera_positions import apart, baseline, joined, plac
 from relpose_ros.inference.evidence import SHIPPED, EvidenceSettings
 from relpose_ros.inference.global_rotations import joint_scores, solve
 from relpose_ros.inference.matches import Matcher, peaks
+from relpose_ros.inference.outlines import find_outline, sighted_translations, sightlines
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import COARSE_LEVEL, GridEmbeddings, PairEnergies
-from relpose_ros.inference.predictions import predicted_translations, regressed_poses
+from relpose_ros.inference.predictions import (
+    about_the_object,
+    predicted_translations,
+    regressed_poses,
+)
 from relpose_ros.inference.refined_poses import settle
 from relpose_ros.inference.robot_frame import RobotFrame, find_robot_frame
 from relpose_ros.inference.rotation_evidence import RotationEvidence
@@ -51,6 +56,7 @@ if TYPE_CHECKING:
     from relpose_ros.estimates import PairRotation
     from relpose_ros.inference.camera_positions import Baseline
     from relpose_ros.inference.matches import TwoViewGeometry
+    from relpose_ros.inference.outlines import Outline
     from relpose_ros.inference.pair_distribution import PairDistributions
     from relpose_ros.network.features import SceneFeatures
     from relpose_ros.network.presets import Preset
@@ -66,9 +72,10 @@ class ScanError(RelPoseError):
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What a scan's pairs say, each by itself."""
+    """What a scan's views and pairs say, each by itself."""
 
     features: SceneFeatures
+    outlines: list[Outline | None]
     geometries: dict[tuple[int, int], TwoViewGeometry]
     energies: PairEnergies
     distributions: PairDistributions
@@ -283,7 +290,7 @@ class Estimator:
             # not the highest density, which a narrow peak has that is hardly ever right.
             known = heaviest_modes(known)
         solution = solve(found.tempered_energies, known).rotations[0]
-        translations = predicted_translations(self._network, found.features, solution.numpy())
+        translations = self._translations(found, solution.numpy())
         covariances = camera_covariances(
             found.distributions, found.energies, solution, translations, found.calibration
         )
@@ -307,6 +314,7 @@ class Estimator:
     def _regressed(self, scan: Scan) -> _Told:
         """What a network says that gives one pose a view, and no probability of it."""
         rotations, translations = regressed_poses(self._network, self._features(scan))
+        translations = about_the_object(rotations, translations, sightlines(_outlines(scan)))
         return _Told(
             rotations,
             cameras.camera_centre(rotations, translations),
@@ -335,11 +343,19 @@ class Estimator:
             energies = energies.mixed(self._grid, calibration.flat)
         return _Found(
             features,
+            _outlines(scan),
             geometries,
             energies,
             search(energies, self._grid),
             replace(calibration, temperature=1.0, flat=0.0),
         )
+
+    def _translations(self, found: _Found, rotations: FloatArray) -> FloatArray:
+        """Where the cameras stand from the object before matches tell more. -> (N, 3)."""
+        if found.calibration.placed_by_boxes:
+            return sighted_translations(found.outlines)
+        predicted = predicted_translations(self._network, found.features, rotations)
+        return about_the_object(rotations, predicted, sightlines(found.outlines))
 
     def _place(
         self,
@@ -358,7 +374,7 @@ class Estimator:
             return rotations, placed, placed_joint
         # The directions between cameras that moved are told by the points, and better.
         guessed = any(view.intrinsics is None for view in scan.views)
-        settled, settled_joint = settle(refined, joint, guessed=guessed)
+        settled, settled_joint = settle(refined, joint, sightlines(found.outlines), guessed=guessed)
         others = [camera for camera in range(len(rotations)) if camera not in refined.moved]
         left = [each for each in baselines if each.i in others or each.j in others]
         settled[others] = centres[others]
@@ -403,6 +419,10 @@ class Estimator:
     def _matcher_of(self, evidence: EvidenceSettings) -> Matcher | None:
         alone = self._regresses or evidence.use == "network"
         return None if alone else Matcher(surroundings=evidence.surroundings)
+
+
+def _outlines(scan: Scan) -> list[Outline | None]:
+    return [find_outline(view) for view in scan.views]
 
 
 def _baselines(

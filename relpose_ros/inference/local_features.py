@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from relpose_ros.views import Intrinsics
+from relpose_ros.inference.outlines import find_outline, focal_lengths, known_rays, rays_of
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from relpose_ros.views import Distortion, View
+    from relpose_ros.inference.outlines import Outline
+    from relpose_ros.views import View
 
     FloatArray = npt.NDArray[np.float64]
     IntArray = npt.NDArray[np.int64]
@@ -45,21 +46,8 @@ ROUNDING = 1e-5
 """Of a squared distance of descriptors."""
 SQUEEZE = 2.0
 """Factor by which the width of the picture is divided: surfaces turned by 60 degrees."""
-WIDEST_RAY = 20.0
-"""Of a ray's coordinates, 87 degrees off the axis: so far out no calibration holds. OpenCV gives a million
-where it finds no ray that the lens would have bent to a pixel."""
 SAME_PLACE = 2.0
 """Pixels within which a feature of the squeezed picture is one of the picture as it is."""
-
-
-@dataclass(frozen=True, eq=False)
-class Outline:
-    """The object's box as a camera sees it."""
-
-    middle: FloatArray
-    """(2,) ray."""
-    size: float
-    """Length of its diagonal, in units of rays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +72,7 @@ class LocalFeatures:
     """Whether features of what stands around the object may be among them, although they should not: a box
     has room for them, and no mask tells them apart."""
     outline: Outline | None = None
-    """None where the box is the whole picture, which says nothing of the object, or where no rays are known
-    of its corners."""
+    """As `relpose_ros.inference.outlines.find_outline` has it."""
 
     @cached_property
     def extent(self) -> float:
@@ -126,23 +113,16 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
     # Sizes are whole: the sides may have been scaled a little differently.
     pixels = points * [picture.shape[1] / grey.shape[1], picture.shape[0] / grey.shape[0]]
     pixels += [left + view.origin[0], top + view.origin[1]]
-    intrinsics = view.intrinsics or Intrinsics.guessed(view.full_width, view.full_height)
-    focal = np.array([intrinsics.fx, intrinsics.fy])
-    rays = _straightened((pixels - [intrinsics.cx, intrinsics.cy]) / focal, view.distortion)
-    known = _known(rays)
+    rays = rays_of(view, pixels)
+    known = known_rays(rays)
     plain = int(known[: len(found[0][0])].sum())
     places = _places(points[known], plain)
-    pixel = 1 / (scale * float(focal.mean()))
-    box = view.box
-    full = box.x0 <= 0 and box.y0 <= 0 and box.x1 >= view.full_width and box.y1 >= view.full_height
-    corners = (np.array([[box.x0, box.y0], [box.x1, box.y1]]) - [intrinsics.cx, intrinsics.cy]) / focal
-    corners = _straightened(corners, view.distortion)
-    outline = Outline(corners.mean(0), float(np.linalg.norm(corners[1] - corners[0])))
+    pixel = 1 / (scale * float(focal_lengths(view).mean()))
     return LocalFeatures(
         *(rays[known], orientations[known], descriptors[known], places, plain, pixel),
         guessed=view.intrinsics is None,
         strays=view.mask is None and not surroundings,
-        outline=None if full or not _known(corners).all() else outline,
+        outline=find_outline(view),
     )
 
 
@@ -206,29 +186,6 @@ def _detect(grey: Any, region: Any, most: int) -> tuple[FloatArray, FloatArray, 
     # OpenCV's (0, 0) is the first pixel's centre.
     places = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5
     return places, np.radians([point.angle for point in points]), descriptors
-
-
-def _straightened(rays: FloatArray, distortion: Distortion | None) -> FloatArray:
-    """Rays (K, 2) as they were before the lens bent them."""
-    import cv2
-
-    if distortion is None or len(rays) == 0:
-        return rays
-    bent, coefficients = rays[:, None], np.array(distortion.coefficients)
-    if distortion.equidistant:
-        straight: Any = cv2.fisheye.undistortPoints(bent, np.eye(3), coefficients)
-    else:
-        # Five iterations, the default, leave pixels of error in the corners of a wide picture. OpenCV 4 lets
-        # a function of another name have more.
-        undo: Any = vars(cv2).get("undistortPointsIter", cv2.undistortPoints)
-        criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
-        straight = undo(bent, np.eye(3), coefficients, R=None, P=None, criteria=criteria)
-    return np.asarray(straight[:, 0], np.float64)
-
-
-def _known(rays: FloatArray) -> npt.NDArray[np.bool_]:
-    """Which rays (K, 2) the lens's model tells."""
-    return np.asarray((np.abs(rays) < WIDEST_RAY).all(1))
 
 
 def _squeezed(grey: Any, region: Any) -> tuple[Any, Any]:

@@ -21,6 +21,7 @@ from relpose_ros.geometry.cameras import homogeneous
 from relpose_ros.inference import epipolar
 from relpose_ros.inference.epipolar import Poses
 from relpose_ros.inference.local_features import extent, find_features, match
+from relpose_ros.inference.outlines import sighted_translations
 from relpose_ros.inference.rotation_evidence import Peak
 from relpose_ros.inference.side_by_side import side_by_side
 from relpose_ros.inference.uncertainty import BASIN
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from relpose_ros.inference.local_features import LocalFeatures, Outline
+    from relpose_ros.inference.local_features import LocalFeatures
+    from relpose_ros.inference.outlines import Outline
     from relpose_ros.views import View
 
     FloatArray = npt.NDArray[np.float64]
@@ -283,20 +285,17 @@ def _of_plane(rays_i: FloatArray, rays_j: FloatArray, pixel: float) -> Poses:
 def _look_at(poses: Poses, first: Outline | None, second: Outline | None) -> FloatArray:
     """Log densities of the poses' directions, if both cameras see the object where its box is. -> (S,).
 
-    The rotation then says where the second camera is: at a distance that the box tells, on the ray through
-    its middle. That is one number more than matches have which leave the angle between the views open.
+    The rotation then says where the second camera is (`sighted_translations`). That is one number more than
+    matches have which leave the angle between the views open.
     """
     if first is None or second is None:
         return np.zeros(len(poses))
-    ends = []
-    for outline in (first, second):
-        ray = homogeneous(outline.middle)
-        ends.append(ray / np.linalg.norm(ray) / outline.size)  # inversely proportional to the box
+    ends = sighted_translations([first, second])
     chord = ends[1] - poses.rotations @ ends[0]
     length = np.linalg.norm(chord, axis=1)
     misfit = np.linalg.norm(np.cross(chord, poses.directions), axis=1)
     angle = np.arctan2(misfit, (chord * poses.directions).sum(1))
-    relative = length * math.sqrt(first.size * second.size)
+    relative = length / math.sqrt(float(np.linalg.norm(ends[1])))
     deviation = np.minimum(DISTANCE_DEVIATION / np.maximum(relative, 1e-9), WIDEST_DIRECTION)
     tails = (LOOK_AT_FREEDOM + 1) / 2 * np.log1p((angle / deviation) ** 2 / LOOK_AT_FREEDOM)
     return np.asarray(np.log(WIDEST_DIRECTION / deviation) - tails)

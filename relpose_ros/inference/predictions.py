@@ -1,7 +1,7 @@
 """Poses that a network predicts outright, no solver asked: translations, and in one ablation rotations.
 
-Optical frames, column vectors; the object's frame has its origin where the optical axes meet most closely,
-whichever origin the network's preset predicts translations about, and the first camera is at distance 1.
+Optical frames, column vectors; the first camera is at distance 1 from the origin of the object's frame. As
+predicted that is where the optical axes meet most closely, whichever origin the network's preset has.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from relpose_ros.geometry import so3
-from relpose_ros.geometry.cameras import camera_centre, closest_point_to_axes
+from relpose_ros.geometry.cameras import camera_centre, closest_point_to_axes, in_world
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -46,6 +46,26 @@ def predicted_translations(network: RelPose, features: SceneFeatures, rotations:
         origin = closest_point_to_axes(rotations, camera_centre(rotations, translations))
         translations = translations + rotations @ origin
     return np.asarray(translations / max(float(np.linalg.norm(translations[0])), LEAST_DISTANCE))
+
+
+def about_the_object(rotations: FloatArray, translations: FloatArray, sightlines: FloatArray) -> FloatArray:
+    """The same cameras about the object, which need not be where their optical axes meet.
+
+    Each camera sees it along its line of sight, as far away as predicted; the mean of these places counts,
+    which holds where cameras stand close together, too.
+
+    Args:
+        rotations: (N, 3, 3) camera_from_object.
+        translations: (N, 3) about where the axes meet.
+        sightlines: (N, 3) unit vectors towards the object, in the cameras' axes.
+
+    Returns:
+        (N, 3), the first at distance 1.
+    """
+    distances = np.linalg.norm(translations, axis=1, keepdims=True)
+    aside = in_world(rotations, distances * (sightlines - [0, 0, 1])).mean(0)
+    moved = translations + rotations @ aside
+    return np.asarray(moved / max(float(np.linalg.norm(moved[0])), LEAST_DISTANCE))
 
 
 @torch.no_grad()

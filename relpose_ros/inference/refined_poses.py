@@ -1,7 +1,7 @@
 """What a bundle adjustment makes of an estimate: its frame and its covariances.
 
-The object frame has its origin where the optical axes meet most closely and its unit in the first camera's
-distance. Refined poses tell both by themselves, far better than the look-at translations predicted them.
+The object frame has its origin where the cameras' lines of sight to the object meet most closely and its unit
+in the first camera's distance. Refined poses tell both by themselves, far better than was known before.
 """
 
 from __future__ import annotations
@@ -24,14 +24,16 @@ if TYPE_CHECKING:
     FloatArray = npt.NDArray[np.float64]
     IntArray = npt.NDArray[np.int64]
 
-AXES_APART = 0.2
-"""How far from the others' common point the axes of cameras may pass that nobody could refine, in the unit of
-the estimate: of cameras in a hand."""
+SIGHTLINES_APART = 0.1
+"""How far from the others' common point cameras may look that nobody could refine, in the estimate's unit:
+the middle of a box is not the same point of the object from all sides."""
 STEP = 1e-6
 """Of the numeric derivative of the frame by the poses."""
 
 
-def settle(refined: Refined, joint: FloatArray, *, guessed: bool = False) -> tuple[FloatArray, FloatArray]:
+def settle(
+    refined: Refined, joint: FloatArray, sightlines: FloatArray, *, guessed: bool = False
+) -> tuple[FloatArray, FloatArray]:
     """Centres and joint covariance after a bundle adjustment, in the frame of the estimate.
 
     What the points tell joins what was known before, widened as a pair's matches are: errors of features near
@@ -42,6 +44,7 @@ def settle(refined: Refined, joint: FloatArray, *, guessed: bool = False) -> tup
     Args:
         refined: The adjustment's poses and what its points tell.
         joint: (6 N, 6 N) covariance before.
+        sightlines: (N, 3) unit vectors towards the object, in the cameras' axes.
         guessed: Whether a focal length was guessed. Points cannot tell: through a wrong one they fit poses
             that go around the object by more or less.
 
@@ -68,7 +71,9 @@ def settle(refined: Refined, joint: FloatArray, *, guessed: bool = False) -> tup
     spread = np.asarray(np.linalg.inv(before + told))
     if 0 in moved:
         silent = 1 - len(moved) / len(rotations)
-        centres[moved], spread = _about_the_axes(rotations[moved], centres[moved], spread, silent)
+        centres[moved], spread = _about_the_object(
+            rotations[moved], centres[moved], sightlines[moved], spread, silent
+        )
     for slot, camera in enumerate(moved):
         own = np.arange(6 * slot, 6 * slot + 6)
         spread[own[:3], own[:3]] += MATCHING_FLOOR**2 * float(centres[camera] @ centres[camera])
@@ -114,38 +119,40 @@ def _by_adjustment(camera_from_object: FloatArray, translation: FloatArray) -> F
     return change
 
 
-def _about_the_axes(
-    rotations: FloatArray, centres: FloatArray, spread: FloatArray, silent: float
+def _about_the_object(
+    rotations: FloatArray, centres: FloatArray, sightlines: FloatArray, spread: FloatArray, silent: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Origin where the axes meet, first camera at distance 1; as it was where they hardly meet.
+    """Origin where the lines of sight meet, first camera at distance 1; as it was where they hardly meet.
 
     Args:
         rotations: (M, 3, 3) camera_from_object, the scan's first camera first.
         centres: (M, 3).
+        sightlines: (M, 3).
         spread: (6 M, 6 M) their covariance.
-        silent: Share of the scan's cameras that are not among these, whose axes belong to the origin too.
+        silent: Share of the scan's cameras that are not among these, which the origin belongs to as well.
     """
-    origin = cameras.closest_point_to_axes(rotations, centres)
-    in_front = np.einsum("ma,ma->m", rotations[:, 2], origin - centres)
+    rays = cameras.in_world(rotations, sightlines)
+    origin = cameras.closest_point_to_rays(rays, centres)
+    in_front = np.einsum("ma,ma->m", rays, origin - centres)
     if in_front.min() <= 0:
         return centres, spread
     size = len(spread)
     jacobian = np.eye(size)
     positions = rows_of(range(len(centres)), 3)
     shifts = STEP * np.eye(size).reshape(size, len(centres), 6)
-    above, below = (_framed(rotations, centres, sign * shifts) for sign in (1.0, -1.0))
+    above, below = (_framed(rays, centres, sign * shifts) for sign in (1.0, -1.0))
     jacobian[positions] = (above - below).reshape(size, -1).T / (2 * STEP)
     framed = jacobian @ spread @ jacobian.T
     if np.trace(framed[np.ix_(positions, positions)]) > np.trace(spread[np.ix_(positions, positions)]):
         return centres, spread
     together = np.kron(np.ones((len(centres), len(centres))), np.eye(3))
-    framed[np.ix_(positions, positions)] += (AXES_APART * silent) ** 2 * together
-    return _framed(rotations, centres, np.zeros((len(centres), 6))), framed
+    framed[np.ix_(positions, positions)] += (SIGHTLINES_APART * silent) ** 2 * together
+    return _framed(rays, centres, np.zeros((len(centres), 6))), framed
 
 
-def _framed(rotations: FloatArray, centres: FloatArray, change: FloatArray) -> FloatArray:
-    """Centres about the point closest to all axes, after changes (..., M, 6) of positions and rotations."""
-    turned = rotations @ so3.exp(-change[..., 3:])
+def _framed(rays: FloatArray, centres: FloatArray, change: FloatArray) -> FloatArray:
+    """Centres about the point closest to all rays, after changes (..., M, 6) of positions and rotations."""
+    turned = (so3.exp(change[..., 3:]) @ rays[..., None])[..., 0]
     moved = centres + change[..., :3]
-    offsets = moved - cameras.closest_point_to_axes(turned, moved)[..., None, :]
+    offsets = moved - cameras.closest_point_to_rays(turned, moved)[..., None, :]
     return np.asarray(offsets / np.linalg.norm(offsets[..., :1, :], axis=-1, keepdims=True))

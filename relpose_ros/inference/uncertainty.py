@@ -360,7 +360,7 @@ def covariances_of_unknown_trust(
     Args:
         rotations: (N, 3, 3) camera_from_object.
         translations: (N, 3), as there.
-        calibration: whose ``translation_sigma`` counts.
+        calibration: whose ``position_sigma`` counts.
     """
     spread = np.repeat(UNIFORM_VARIANCE * np.eye(3)[None], len(rotations), 0)
     spread[0] = 0
@@ -372,12 +372,11 @@ def _in_object_frame(
 ) -> FloatArray:
     """Covariances (N, 6, 6) of poses from those of their rotations, (N, 3, 3) in the cameras' own axes."""
     spread = spread + SOLVER_FLOOR**2 * np.eye(3)
-    sigma = np.diag(np.square(calibration.translation_sigma))
-    shifts = np.repeat(sigma[None], len(rotations), 0)
+    across, along = calibration.position_sigma
+    rays = translations / np.linalg.norm(translations, axis=1, keepdims=True)
+    shifts = across**2 * np.eye(3) + (along**2 - across**2) * rays[:, :, None] * rays[:, None, :]
     # By definition of the unit of length the first camera's distance is one.
-    direction = translations[0] / np.linalg.norm(translations[0])
-    across = np.eye(3) - np.outer(direction, direction)
-    shifts[0] = across @ sigma @ across + SOLVER_FLOOR**2 * np.eye(3)
+    shifts[0] += (SOLVER_FLOOR**2 - along**2) * np.outer(rays[0], rays[0])
     covariances = np.zeros((len(rotations), 6, 6))
     for camera, object_from_camera in enumerate(rotations.transpose(0, 2, 1)):
         # A turn e of the camera (axes of the camera, left perturbation of camera_from_object) is the turn

@@ -9,6 +9,7 @@ from relpose_ros.estimates import CameraPose, Evidence, Mode, PairRotation, Scan
 from relpose_ros.evaluation import trust
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import camera_centre, look_at, look_at_translations, translation_of
+from relpose_ros.views import BoundingBox, Intrinsics, View
 
 SIGMA = 0.1
 """Standard deviation of every error drawn here, rad and units of the first camera's distance."""
@@ -22,9 +23,14 @@ def truth(generator, count):
     return rotations, translation_of(rotations, centres)
 
 
-def estimated(generator, rotations, translations, *, stated=SIGMA, verdict=Verdict.ENOUGH):
+def unboxed(count):
+    """Views whose box is the whole picture, so that the object is where their axes meet."""
+    return [View(np.zeros((2, 2, 3), np.uint8), BoundingBox(0, 0, 2, 2), 2, 2)] * count
+
+
+def estimated(generator, rotations, translations, *, stated=SIGMA, sightlines=(0, 0, 1)):
     """An estimate whose every number is off by a draw of SIGMA, and which states ``stated``."""
-    about_look_at, _, _ = look_at_translations(rotations, translations)
+    about_look_at, _, _ = look_at_translations(rotations, translations, sightlines)
     object_axes = rotations @ rotations[0].T
     centres = camera_centre(object_axes, about_look_at)
     covariance = stated**2 * np.eye(6)
@@ -46,7 +52,7 @@ def estimated(generator, rotations, translations, *, stated=SIGMA, verdict=Verdi
             pairs.append(
                 PairRotation(i, j, found, covariance[:3, :3], -3.0, 0.8, (mode,), False, 0.0, 0.8, 0.0)
             )
-    return ScanEstimate("cup", cameras, tuple(pairs), 0.0, False, True, verdict, 0, "enough", 0.1)
+    return ScanEstimate("cup", cameras, tuple(pairs), 0.0, False, True, Verdict.ENOUGH, 0, "enough", 0.1)
 
 
 @pytest.fixture
@@ -57,7 +63,7 @@ def group():
         for _ in range(scans):
             rotations, translations = truth(generator, count)
             estimate = estimated(generator, rotations, translations, **options)
-            made.append(trust.statements(estimate, rotations, translations))
+            made.append(trust.statements(estimate, unboxed(len(rotations)), rotations, translations))
         return made
 
     return make
@@ -89,10 +95,11 @@ def test_pairs_that_matches_speak_of_are_told_apart():
     generator = np.random.default_rng(2)
     rotations, translations = truth(generator, 4)
     estimate = estimated(generator, rotations, translations)
-    assert "matched_stated@15" not in trust.summary([trust.statements(estimate, rotations, translations)])
+    said = trust.statements(estimate, unboxed(4), rotations, translations)
+    assert "matched_stated@15" not in trust.summary([said])
     matched = replace(estimate.pairs[1], evidence=Evidence.GEOMETRIC, probability_within_15_deg=0.99)
     estimate = replace(estimate, pairs=(estimate.pairs[0], matched, *estimate.pairs[2:]))
-    figures = trust.summary([trust.statements(estimate, rotations, translations)])
+    figures = trust.summary([trust.statements(estimate, unboxed(len(rotations)), rotations, translations)])
     assert figures["matched_pairs"] == pytest.approx(1 / 6)
     assert figures["matched_stated@15"] == pytest.approx(0.99)
     assert figures["stated@15"] == pytest.approx((5 * 0.8 + 0.99) / 6)
@@ -102,11 +109,28 @@ def test_enough_is_wrong_where_a_pair_of_the_final_poses_is_off():
     generator = np.random.default_rng(3)
     rotations, translations = truth(generator, 3)
     estimate = estimated(generator, rotations, translations)
-    right = trust.statements(estimate, rotations, translations)
+    right = trust.statements(estimate, unboxed(len(rotations)), rotations, translations)
     turned = so3.exp([0, 0, np.radians(60)]) @ estimate.cameras[2].object_from_camera
     cameras = (*estimate.cameras[:2], replace(estimate.cameras[2], object_from_camera=turned))
-    wrong = trust.statements(replace(estimate, cameras=cameras), rotations, translations)
+    wrong = trust.statements(replace(estimate, cameras=cameras), unboxed(3), rotations, translations)
     asks = replace(estimate, cameras=cameras, verdict=Verdict.ONE_MORE_VIEW)
-    careful = trust.statements(asks, rotations, translations)
+    careful = trust.statements(asks, unboxed(3), rotations, translations)
     figures = trust.summary([right, right, wrong, careful])
     assert (figures["enough"], figures["enough_wrong"]) == (0.75, 0.25)
+
+
+def test_positions_are_held_against_the_frame_whose_origin_is_in_the_boxes():
+    """The same cameras and the same truth: the object is not where the axes meet, and the boxes say so."""
+    generator = np.random.default_rng(4)
+    rotations, translations = truth(generator, 5)
+    about_axes, _, _ = look_at_translations(rotations, translations)
+    seen = about_axes + rotations @ [0.4, -0.3, 0.2]
+    rays = seen[:, :2] / seen[:, 2:]
+    views = [
+        replace(view, box=BoundingBox(x - 0.1, y - 0.1, x + 0.1, y + 0.1), intrinsics=Intrinsics(1, 1, 0, 0))
+        for view, (x, y) in zip(unboxed(5), rays, strict=True)
+    ]
+    sightlines = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    estimate = estimated(generator, rotations, translations, sightlines=sightlines)
+    assert trust.statements(estimate, views, rotations, translations).position_squares.max() < 20
+    assert trust.statements(estimate, unboxed(5), rotations, translations).position_squares.max() > 100

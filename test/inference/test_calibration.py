@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from relpose_ros.geometry import so3
+from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.calibration import (
     Calibration,
     expected_calibration_error,
@@ -14,6 +14,7 @@ from relpose_ros.inference.calibration import (
     measure_calibration,
     observe,
 )
+from relpose_ros.inference.outlines import Outline
 from relpose_ros.inference.pair_energies import GridEmbeddings
 
 SIGMA = (0.03, 0.05, 0.12)
@@ -41,7 +42,7 @@ def observations(scene_type, count, temperature, seed):
         true = np.tile([0.0, 0.0, 1.0], (2, 1))
         predicted = true + rng.normal(0, SIGMA, (2, 3)) * [[0], [1]]
         grid = grid or GridEmbeddings(scene)
-        result.append(observe(scene, grid, scene, predicted, rotations, true))
+        result.append(observe(scene, grid, scene, predicted, [None, None], rotations, true))
     return result
 
 
@@ -76,8 +77,35 @@ def test_well_calibrated_energies_are_left_alone(fisher_scene_type):
     assert calibration.pair_spread == pytest.approx(1.0, abs=0.3)
 
 
+@pytest.mark.parametrize("by_boxes", [True, False])
+def test_cameras_are_placed_by_whichever_is_nearer_to_the_truth(fisher_scene_type, by_boxes):
+    """The object is off the middle of the pictures, and at other distances than they all have in common."""
+    rng = np.random.default_rng(5)
+    grid, made = None, []
+    for _ in range(20):
+        rotations = fisher_scene_type[1](3, int(rng.integers(1 << 30)))
+        scene = fisher_scene_type[0](rotations)
+        grid = grid or GridEmbeddings(scene)
+        true = rng.normal((0, 0, 1), 0.1, (3, 3))
+        # The root of their area goes with the square of nearness: the half that is believed is all of it.
+        sides = np.linalg.norm(true, axis=1) ** -2 * np.exp(rng.normal(0, 0 if by_boxes else 0.5, 3))
+        boxes = [
+            Outline(t[:2] / t[2] + rng.normal(0, 0.02, 2), np.array([2.0, 0.5]) * side)
+            for t, side in zip(true, sides, strict=True)
+        ]
+        about_axes = cameras.look_at_translations(rotations, true)[0]
+        predicted = about_axes + rng.normal(0, 0.1 if by_boxes else 1e-4, (3, 3))
+        made.append(observe(scene, grid, scene, predicted, boxes, rotations, true))
+    fitted = fit_calibration(made)
+    assert fitted.placed_by_boxes is by_boxes
+    across, along = fitted.position_sigma
+    assert 0.01 < across < 0.04
+    assert along < 0.05
+    assert fit_calibration(made, least_sigma=(0.05, 0.1)).position_sigma == (0.05, 0.1)
+
+
 def test_kept_with_the_weights_as_text():
-    calibration = Calibration(2.5, 1.1, 0.9, (0.1, 0.2, 0.3))
+    calibration = Calibration(2.5, 1.1, 0.9, True, (0.1, 0.3))
     assert Calibration.from_json(calibration.to_json()) == calibration
     assert Calibration.from_json('{"temperature": 2.0, "report": {"pairs": 3}}') == Calibration(
         temperature=2.0
@@ -97,9 +125,9 @@ def test_truth_in_any_frame_and_unit(fisher_scene_type):
     translations = np.tile([0.0, 0.0, 2.0], (3, 1))
     moved = rotations @ so3.exp([0.3, 0.2, 0.1])
     shifted = 5 * (translations + moved @ [1.0, 2.0, 3.0])
-    grid = GridEmbeddings(scene)
-    one = observe(scene, grid, scene, translations, rotations, translations)
-    other = observe(scene, grid, scene, translations, moved, shifted)
+    grid, outlines = GridEmbeddings(scene), [None] * 3
+    one = observe(scene, grid, scene, translations, outlines, rotations, translations)
+    other = observe(scene, grid, scene, translations, outlines, moved, shifted)
     np.testing.assert_allclose(one.true_rotations, other.true_rotations, atol=1e-9)
     np.testing.assert_allclose(one.true_translations, other.true_translations, atol=1e-6)
     torch.testing.assert_close(one.energy_at_truth, other.energy_at_truth, atol=1e-3, rtol=0)

@@ -17,16 +17,21 @@ from relpose_ros.inference import bundle_adjustment, matches
 from relpose_ros.inference.bundle_adjustment import Refined
 from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.estimator import OWN_THREADS, Estimator, EvidenceSettings, ScanError
-from relpose_ros.inference.predictions import regressed_poses
+from relpose_ros.inference.outlines import find_outline, sighted_translations, sightlines
+from relpose_ros.inference.predictions import about_the_object, predicted_translations, regressed_poses
 from relpose_ros.network.checkpoint import random_network, write_network
 from relpose_ros.network.features import SceneFeatures
 from relpose_ros.network.presets import PRESETS, named_preset
-from relpose_ros.views import BoundingBox, RobotPose, Scan, View
+from relpose_ros.views import BoundingBox, Intrinsics, RobotPose, Scan, View
 
 
 @pytest.fixture(scope="module")
 def network():
     return random_network("compact", 1)
+
+
+ALONE = EvidenceSettings("network")
+LENS = Intrinsics(70, 70, 40, 30)
 
 
 def picture(seed):
@@ -36,6 +41,14 @@ def picture(seed):
 
 def scan(*seeds):
     return Scan("mug", tuple(picture(seed) for seed in seeds))
+
+
+def whole(views):
+    """The same scan of pictures that no detector has looked at."""
+    boxes = [BoundingBox(0, 0, view.full_width, view.full_height) for view in views.views]
+    return replace(
+        views, views=tuple(replace(view, box=box) for view, box in zip(views.views, boxes, strict=True))
+    )
 
 
 def numbers(estimate):
@@ -90,7 +103,7 @@ def test_score_is_the_sum_of_the_pairs_energies_of_the_network(network):
 
 def test_positions_are_those_of_the_translations(network):
     estimator = Estimator(network)
-    views = scan(3, 4, 5)
+    views = whole(scan(3, 4, 5))
     estimate = estimator.estimate(views)
     with torch.no_grad():
         predicted = network.optical_translations(estimator._features(views)).double().numpy()
@@ -131,9 +144,9 @@ def test_each_view_is_looked_at_once_and_forgotten_with_the_view(network, monkey
 
 def test_other_evidence_on_the_same_weights(network):
     given = Estimator(network, CALIBRATED)
-    alone = given.with_evidence(EvidenceSettings("network"))
+    alone = given.with_evidence(ALONE)
     assert numbers(alone.estimate(scan(0, 1))) == numbers(
-        Estimator(network, CALIBRATED, EvidenceSettings("network")).estimate(scan(0, 1))
+        Estimator(network, CALIBRATED, ALONE).estimate(scan(0, 1))
     )
     assert alone.preset is network.preset
     assert len(given._looks) == 0
@@ -143,7 +156,7 @@ def test_other_evidence_on_the_same_weights(network):
 def test_two_views_are_told_as_their_most_probable_mode(network, seed):
     """Other peaks of these pairs are higher, and narrower: without probabilities the highest one is told."""
     calibrated, plain = (
-        Estimator(network, calibration, EvidenceSettings("network")).estimate(scan(2 * seed, 2 * seed + 1))
+        Estimator(network, calibration, ALONE).estimate(scan(2 * seed, 2 * seed + 1))
         for calibration in (Calibration(temperature=0.02), None)
     )
     probable = calibrated.pairs[0].modes[0].camera_j_from_camera_i
@@ -183,7 +196,7 @@ def test_threads_do_not_mix_scans(network):
 
 def test_weights_bring_their_calibration(network, tmp_path):
     pytest.importorskip("safetensors")
-    calibration = Calibration(temperature=3.0, translation_sigma=(0.05, 0.05, 0.1))
+    calibration = Calibration(temperature=3.0, position_sigma=(0.05, 0.1))
     write_network(network, tmp_path / "calibrated.safetensors", {"calibration": calibration.to_json()})
     write_network(network, tmp_path / "plain.safetensors")
     calibrated = Estimator.from_weights(tmp_path / "calibrated.safetensors").estimate(scan(0, 1, 2))
@@ -201,9 +214,7 @@ def test_a_backbone_in_bfloat16_is_asked_for_when_weights_are_loaded(tmp_path):
     residual = replace(PRESETS["compact"], backbone="residual", stage_depths=(1, 1, 1, 1))
     write_network(random_network(residual, 1), file)
     exact, lowered = (
-        Estimator.from_weights(
-            file, evidence=EvidenceSettings("network"), backbone_in_bfloat16=lower
-        ).estimate(scan(0, 1))
+        Estimator.from_weights(file, evidence=ALONE, backbone_in_bfloat16=lower).estimate(scan(0, 1))
         for lower in (False, True)
     )
     assert numbers(exact) != numbers(lowered)
@@ -220,14 +231,40 @@ def test_rotations_of_features(network):
     np.testing.assert_array_equal(estimator.rotations(features), expected)
 
 
+def poses(estimate):
+    rotations = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
+    return rotations, np.stack([camera.position for camera in estimate.cameras])
+
+
 def test_a_network_that_predicts_in_the_first_cameras_frame_gives_the_same_object_frame():
     """Its translations are about the first camera's place; the object's is where the axes meet."""
     network = random_network(named_preset("compact", ["first-camera"]), 1)
-    estimate = Estimator(network, evidence=EvidenceSettings("network")).estimate(scan(0, 1, 2))
-    rotations = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
-    centres = np.stack([camera.position for camera in estimate.cameras])
+    rotations, centres = poses(Estimator(network, evidence=ALONE).estimate(whole(scan(0, 1, 2))))
     np.testing.assert_allclose(cameras.closest_point_to_axes(rotations, centres), np.zeros(3), atol=1e-6)
     assert np.linalg.norm(centres[0]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("by_boxes", [True, False])
+def test_the_origin_is_where_the_boxes_are(by_boxes):
+    """A calibration chooses what places the cameras; either way each sees the origin in its box."""
+    views = Scan(
+        "mug",
+        tuple(
+            replace(picture(k), box=BoundingBox(5 + 10 * k, 8, 45 + 10 * k, 30), intrinsics=LENS)
+            for k in range(3)
+        ),
+    )
+    calibration = Calibration(placed_by_boxes=by_boxes)
+    estimator = Estimator(random_network("compact", 1), calibration, ALONE)
+    rotations, centres = poses(estimator.estimate(views))
+    translations = cameras.translation_of(rotations, centres)
+    outlines = [find_outline(view) for view in views.views]
+    expected = sighted_translations(outlines)
+    if not by_boxes:
+        predicted = predicted_translations(estimator._network, estimator.features(views), rotations)
+        expected = about_the_object(rotations, predicted, sightlines(outlines))
+    np.testing.assert_allclose(translations, expected, atol=1e-9)
+    assert np.linalg.norm(translations[0]) == pytest.approx(1)
 
 
 # A network that regresses poses has no probabilities to tell.
@@ -240,7 +277,7 @@ def regressing(request):
 
 def test_regressed_poses_come_through_the_same_door(regressing):
     estimator = Estimator(regressing)
-    views = scan(0, 1, 2)
+    views = whole(scan(0, 1, 2))
     estimate = estimator.estimate(views)
     with torch.no_grad():
         features = estimator._features(views)
@@ -422,7 +459,7 @@ def test_off_looks_for_no_features(network, ball, monkeypatch):
 
 
 def test_other_evidence_from_the_next_estimate_on(network, ball, of_ball):
-    changing = Estimator(network, CALIBRATED, EvidenceSettings("network"))
+    changing = Estimator(network, CALIBRATED, ALONE)
     for chosen in (
         {"use": "pairs"},
         {"use": "refine"},

@@ -15,6 +15,7 @@ from relpose_ros.inference.local_features import (
     match,
 )
 from relpose_ros.inference.matches import NOTHING, relate
+from relpose_ros.inference.outlines import find_outline
 from relpose_ros.views import BoundingBox, Distortion, Intrinsics, View
 
 
@@ -228,19 +229,9 @@ def test_a_mask_alone_keeps_strays_out(textured):
     assert not find_features(replace(view, mask=np.ones(view.image.shape[:2], bool))).strays
 
 
-def test_the_outline_is_the_box_as_the_camera_sees_it(textured):
-    box = BoundingBox(40, 20, 100, 100)
-    view = replace(textured(0), box=box, intrinsics=Intrinsics(200, 100, 100, 80))
-    outline = find_features(view).outline
-    np.testing.assert_allclose(outline.middle, [-0.15, -0.2])
-    assert outline.size == pytest.approx(np.hypot(60 / 200, 80 / 100))
-    # The same in a message that carries no more than the object.
-    part = replace(view, image=view.image[20:100, 40:100], origin=(40, 20))
-    np.testing.assert_allclose(find_features(part).outline.middle, outline.middle)
-    assert find_features(replace(view, box=BoundingBox(0, 0, 200, 160))).outline is None
-    # A barrel lens shrinks what lies far from the axis.
-    bent = replace(view, distortion=Distortion((-0.2, 0.0, 0.0, 0.0, 0.0)))
-    assert find_features(bent).outline.size > 1.05 * outline.size
+def test_features_come_with_the_outline_of_their_box(textured):
+    view = replace(textured(0), box=BoundingBox(40, 20, 100, 100))
+    np.testing.assert_array_equal(find_features(view).outline.middle, find_outline(view).middle)
 
 
 def test_a_surface_at_a_slant_matches(textured):

@@ -13,7 +13,7 @@ from relpose_ros.captures.folder import load_capture
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import homogeneous
 from relpose_ros.inference import matches
-from relpose_ros.inference.local_features import LocalFeatures, Outline, find_features
+from relpose_ros.inference.local_features import LocalFeatures, find_features
 from relpose_ros.inference.matches import (
     LEAST_MATCHES,
     NOTHING,
@@ -26,6 +26,7 @@ from relpose_ros.inference.matches import (
     relate,
     trust,
 )
+from relpose_ros.inference.outlines import Outline
 from relpose_ros.views import BoundingBox
 
 
@@ -262,8 +263,10 @@ def test_accidental_matches_support_a_pose_less(point_scene):
     assert trust(right.support) > 0.9
 
 
-def outlined(features, middle, size):
-    return replace(features, outline=Outline(np.array(middle), size))
+def outlined(features, local):
+    """Of an object somewhere in the camera's axes; its apparent size goes with the square of its nearness."""
+    side = 0.2 / (local @ local)
+    return replace(features, outline=Outline(local[:2] / local[2], np.array([side, side])))
 
 
 def test_cameras_that_look_at_the_object_tell_between_explanations(point_scene):
@@ -273,11 +276,7 @@ def test_cameras_that_look_at_the_object_tell_between_explanations(point_scene):
         scene = point_scene.ring([0, 40], points=150, seed=seed)
         scene.points *= 0.4
         views = scene.features(noise=0.5, outliers=30, seed=seed)
-        distances = np.linalg.norm(scene.translations, axis=1)
-        boxes = [
-            outlined(view, local[:2] / local[2], 0.2 / distance)
-            for view, local, distance in zip(views, scene.translations, distances, strict=True)
-        ]
+        boxes = [outlined(view, local) for view, local in zip(views, scene.translations, strict=True)]
         for pair, weights in ((views, alone), (boxes, together)):
             poses = relate(*pair).poses
             right = [p.weight for p in poses if degrees(p.rotation, scene.relative(0, 1)[0]) < 8]

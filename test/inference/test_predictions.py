@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relpose_ros.geometry import cameras, so3
-from relpose_ros.inference.predictions import predicted_translations, regressed_poses
+from relpose_ros.inference.predictions import about_the_object, predicted_translations, regressed_poses
 from relpose_ros.network.checkpoint import random_network
 from relpose_ros.network.presets import named_preset
 from relpose_ros.network.relpose import NetworkUseError
@@ -59,6 +59,30 @@ def test_poses_are_the_same_whichever_origin_they_were_learned_about(seed, views
         turned, moved = regressed_poses(oracle, None)
         np.testing.assert_allclose(turned, rotations, atol=1e-12)
         np.testing.assert_allclose(moved, expected, atol=1e-6)
+
+
+def test_the_origin_is_moved_to_where_the_cameras_see_the_object():
+    """Their axes meet beside it: everything is where it was but for the origin and the unit."""
+    generator = np.random.default_rng(0)
+    rotations = so3.random_rotations(6, generator)
+    rotations = rotations @ rotations[0].T
+    object_at = np.array([0.05, -0.1, 0.02])
+    translations = np.tile([0.0, 0, 1], (6, 1))
+    seen = translations + rotations @ object_at
+    sightlines = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    moved = about_the_object(rotations, translations, sightlines)
+    assert np.linalg.norm(moved[0]) == pytest.approx(1)
+    # Distances to the object are not quite those to where the axes meet: to second order it is exact.
+    np.testing.assert_allclose(moved, seen / np.linalg.norm(seen[0]), atol=0.04)
+    still = np.linalg.norm(translations / np.linalg.norm(seen[0]) - seen / np.linalg.norm(seen[0]), axis=1)
+    assert still.min() > 0.1, "as predicted it is further off"
+
+
+def test_cameras_that_look_straight_at_the_object_stay_where_they_are():
+    rotations, translations = scan(3, 5)
+    ahead = np.tile([0.0, 0, 1], (5, 1))
+    same = about_the_object(rotations, translations, ahead)
+    np.testing.assert_allclose(same, translations / np.linalg.norm(translations[0]), atol=1e-12)
 
 
 def test_predictions_of_nothing_are_finite():

@@ -39,6 +39,11 @@ def before(count):
     return joined(covariances)
 
 
+def settled(refined, joint, **options):
+    """Of cameras that look straight at the object."""
+    return settle(refined, joint, np.tile([0.0, 0, 1], (len(refined.rotations), 1)), **options)
+
+
 def true_centres(scene):
     """As the object frame has them: about the point closest to all axes, the first at distance 1."""
     translations, _, _ = cameras.look_at_translations(scene.rotations, scene.translations)
@@ -48,10 +53,26 @@ def true_centres(scene):
 def test_the_origin_is_where_the_axes_meet_and_the_first_camera_at_distance_one(point_scene):
     scene = point_scene.ring(ANGLES)
     refined = adjusted(scene)
-    centres, _ = settle(refined, before(4))
+    centres, _ = settled(refined, before(4))
     np.testing.assert_allclose(cameras.closest_point_to_axes(refined.rotations, centres), 0, atol=1e-9)
     assert np.linalg.norm(centres[0]) == pytest.approx(1)
     assert np.linalg.norm(centres - true_centres(scene), axis=1).max() < 0.02
+
+
+def test_the_origin_is_where_the_lines_of_sight_meet(point_scene):
+    """Of an object that is not where the axes meet."""
+    scene = point_scene.ring(ANGLES)
+    refined = adjusted(scene)
+    seen = scene.translations + scene.rotations @ [0.2, 0.1, -0.1]
+    sightlines = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    centres, joint = settle(refined, before(4), sightlines)
+    rays = cameras.in_world(refined.rotations, sightlines)
+    np.testing.assert_allclose(cameras.closest_point_to_rays(rays, centres), 0, atol=1e-9)
+    true = cameras.camera_centre(scene.rotations, seen / np.linalg.norm(seen[0]))
+    assert np.linalg.norm(centres - true, axis=1).max() < 0.02
+    errors = (centres - true)[1:]
+    stated = apart(joint)[1:, :3, :3]
+    assert (np.einsum("na,nab,nb->n", errors, np.linalg.inv(stated), errors) < 16).all()
 
 
 class Stretched:
@@ -76,7 +97,7 @@ def test_a_guessed_focal_length_that_is_wrong_is_allowed_for(angles, factor, poi
         scene = Stretched(point_scene.ring(angles, seed=seed), factor)
         refined = adjusted(scene, seed=seed)
         for errors, guess in ((known, False), (guessed, True)):
-            _, joint = settle(refined, before(len(angles)), guessed=guess)
+            _, joint = settled(refined, before(len(angles)), guessed=guess)
             for camera, covariance in enumerate(apart(joint)[1:, 3:, 3:], start=1):
                 turn = so3.log(scene.rotations[camera].T @ refined.rotations[camera])
                 errors.append(turn @ np.linalg.solve(covariance, turn))
@@ -90,7 +111,7 @@ def test_errors_are_within_what_is_stated_and_that_is_less_than_before(point_sce
     for seed in range(6):
         scene = point_scene.ring(ANGLES, seed=seed)
         refined = adjusted(scene, noise=1.0, degrees=0.5, shift=0.01, seed=seed)
-        centres, joint = settle(refined, before(4))
+        centres, joint = settled(refined, before(4))
         covariances = apart(joint)
         np.testing.assert_array_equal(joint, joint.T)
         assert np.linalg.eigvalsh(joint).min() > 0
@@ -108,7 +129,7 @@ def test_errors_are_within_what_is_stated_and_that_is_less_than_before(point_sce
 
 def test_fewer_points_know_less(point_scene):
     many, few = (
-        settle(adjusted(point_scene.ring(ANGLES, points=count)), before(4))[1] for count in (200, 40)
+        settled(adjusted(point_scene.ring(ANGLES, points=count)), before(4))[1] for count in (200, 40)
     )
     for rich, poor in zip(apart(many)[1:], apart(few)[1:], strict=True):
         assert np.trace(rich[3:, 3:]) < np.trace(poor[3:, 3:])
@@ -119,12 +140,12 @@ def test_a_camera_that_took_no_part_keeps_what_was_known_of_it(point_scene):
     scene = point_scene.ring(ANGLES)
     refined = adjusted(scene, silent=(2,))
     assert refined.moved == (0, 1, 3)
-    centres, joint = settle(refined, before(4))
+    centres, joint = settled(refined, before(4))
     np.testing.assert_array_equal(apart(joint)[2], BEFORE)
     np.testing.assert_array_equal(joint[12:18, :12], 0)
     np.testing.assert_allclose(centres[2], cameras.camera_centre(refined.rotations, refined.translations)[2])
     # Its axis belongs to the origin too, and nobody knows it.
-    whole = settle(adjusted(scene), before(4))[1]
+    whole = settled(adjusted(scene), before(4))[1]
     assert np.trace(joint[6:9, 6:9]) > 2 * np.trace(whole[6:9, 6:9])
 
 
@@ -132,7 +153,7 @@ def test_cameras_apart_from_the_first_are_known_among_themselves_alone(point_sce
     scene = point_scene.ring(ANGLES)
     refined = adjusted(scene, silent=(0,))
     assert refined.moved == (1, 2, 3)
-    _, joint = settle(refined, before(4))
+    _, joint = settled(refined, before(4))
     assert np.trace(joint[9:12, 9:12]) > 0.3 * np.trace(BEFORE[3:, 3:])
     relative = joint[9:12, 9:12] + joint[15:18, 15:18] - joint[9:12, 15:18] - joint[15:18, 9:12]
     assert np.trace(relative) < 0.1 * np.trace(BEFORE[3:, 3:])
@@ -143,7 +164,7 @@ def test_axes_that_hardly_meet_leave_origin_and_unit_as_they_were(point_scene):
     scene = point_scene.ring([0.0, 2.0, 4.0])
     refined = adjusted(scene, degrees=0.2, shift=0.002)
     known = joined(np.tile(np.diag([0.002**2] * 3 + [math.radians(5) ** 2] * 3), (3, 1, 1)))
-    centres, _ = settle(refined, known)
+    centres, _ = settled(refined, known)
     np.testing.assert_array_equal(centres, cameras.camera_centre(refined.rotations, refined.translations))
 
 
@@ -155,10 +176,10 @@ def test_matches_that_are_not_sure_leave_it_to_what_was_known_how_groups_go_toge
     assert unsure.groups == ((0, 1), (2, 3))
     np.testing.assert_array_equal(sure.rotations, unsure.rotations)
     for camera in (2, 3):
-        known, guessed = (apart(settle(each, before(4))[1])[camera] for each in (sure, unsure))
+        known, guessed = (apart(settled(each, before(4))[1])[camera] for each in (sure, unsure))
         assert np.trace(known[3:, 3:]) < 0.1 * np.trace(BEFORE[3:, 3:])
         assert np.trace(guessed[3:, 3:]) == pytest.approx(np.trace(BEFORE[3:, 3:]), rel=0.15)
-    joint = settle(unsure, before(4))[1]
+    joint = settled(unsure, before(4))[1]
     relative = joint[15:18, 15:18] + joint[21:24, 21:24] - joint[15:18, 21:24] - joint[21:24, 15:18]
     assert np.trace(relative) < 0.1 * np.trace(BEFORE[3:, 3:])
 

@@ -211,12 +211,14 @@ def test_a_mode_that_owns_no_mass_is_not_told_to_be_exact(fisher_scene, cameras_
 def test_position_and_rotation_covary_as_a_camera_on_a_lever(fisher_scene, cameras_around):
     """Against a sample: turns of the camera about the object move its centre too."""
     scene = fisher_scene(cameras_around(2, 5), concentration=200.0)
-    translations = np.array([[0.0, 0.0, 1.0], [0.1, -0.05, 2.0]])
-    calibration = Calibration(translation_sigma=(0.01, 0.02, 0.05))
+    translations = np.array([[0.0, 0.0, 1.0], [0.7, -0.5, 1.8]])
+    calibration = Calibration(position_sigma=(0.02, 0.05))
     _, covariances, rotations = told(scene, calibration, translations)
     rng = np.random.default_rng(0)
     turns = rng.normal(0, math.sqrt(1 / 400), (40_000, 3))  # of the camera, in its own axes
-    shifts = rng.normal(0, calibration.translation_sigma, (40_000, 3))
+    across, along = rng.normal(0, 0.02, (40_000, 3)), rng.normal(0, 0.05, (40_000, 1))
+    ray = translations[1] / np.linalg.norm(translations[1])
+    shifts = across - (across @ ray)[:, None] * ray + along * ray
     turned = so3.exp(turns) @ rotations[1]
     centres = -np.einsum("nji,nj->ni", turned, translations[1] + shifts)
     seen = so3.log(turned.transpose(0, 2, 1) @ rotations[1])  # fixed axes of the object

@@ -1,0 +1,65 @@
+"""Where a camera sees the object, by the box around it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from relpose_ros.geometry import cameras, so3
+from relpose_ros.inference.outlines import Outline, find_outline, sighted_translations, sightlines
+from relpose_ros.views import BoundingBox, Distortion, Intrinsics
+
+
+def test_the_outline_is_the_box_as_the_camera_sees_it(textured):
+    box = BoundingBox(40, 20, 100, 100)
+    view = replace(textured(0), box=box, intrinsics=Intrinsics(200, 100, 100, 80))
+    outline = find_outline(view)
+    np.testing.assert_allclose(outline.middle, [-0.15, -0.2])
+    np.testing.assert_allclose(outline.sides, [60 / 200, 80 / 100])
+    # The same in a message that carries no more than the object.
+    part = replace(view, image=view.image[20:100, 40:100], origin=(40, 20))
+    np.testing.assert_array_equal(find_outline(part).middle, outline.middle)
+    assert find_outline(replace(view, box=BoundingBox(0, 0, 200, 160))) is None
+    # A barrel lens shrinks what lies far from the axis.
+    bent = find_outline(replace(view, distortion=Distortion((-0.2, 0.0, 0.0, 0.0, 0.0))))
+    assert (bent.sides > 1.05 * outline.sides).all()
+
+
+def test_without_intrinsics_a_box_still_says_which_way_the_object_is(textured):
+    view = replace(textured(0), box=BoundingBox(120, 20, 180, 60))
+    (ray,) = sightlines([find_outline(view)])
+    assert ray[0] > 0 > ray[1]
+    assert np.linalg.norm(ray) == pytest.approx(1)
+
+
+def test_boxes_place_cameras_that_see_an_object_in_their_corners():
+    """Cameras at several distances around a ball, which is nowhere near the middle of their pictures."""
+    generator = np.random.default_rng(0)
+    rotations = so3.random_rotations(5, generator)
+    object_in_camera = generator.normal((0, 0, 1), 0.3, (5, 3))
+    distances = np.linalg.norm(object_in_camera, axis=1)
+    outlines = [
+        Outline(place[:2] / place[2], np.full(2, 0.1 / distance))
+        for place, distance in zip(object_in_camera, distances, strict=True)
+    ]
+    placed = sighted_translations(outlines)
+    assert np.linalg.norm(placed[0]) == pytest.approx(1)
+    # Exact in direction; of the sizes half is believed to come from the distance.
+    true = object_in_camera / distances[:, None]
+    np.testing.assert_allclose(placed / np.linalg.norm(placed, axis=1, keepdims=True), true, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(placed, axis=1) ** 2, distances / distances[0], atol=1e-12)
+    # So the object is where the lines of sight meet.
+    centres = cameras.camera_centre(rotations, placed)
+    origin = cameras.closest_point_to_rays(cameras.in_world(rotations, sightlines(outlines)), centres)
+    np.testing.assert_allclose(origin, 0, atol=1e-9)
+
+
+def test_a_view_without_a_box_is_ahead_and_as_far_as_the_others():
+    near, far = (Outline(np.zeros(2), np.full(2, side)) for side in (0.4, 0.1))
+    placed = sighted_translations([near, None, far])
+    np.testing.assert_allclose(placed, [[0, 0, 1], [0, 0, 2**0.5], [0, 0, 2]], atol=1e-12)
+    np.testing.assert_array_equal(sighted_translations([None, None]), [[0, 0, 1], [0, 0, 1]])
+    flat = Outline(np.zeros(2), np.array([0.3, 0.0]))  # a box of no height
+    assert np.isfinite(sighted_translations([flat, near])).all()
