@@ -42,6 +42,11 @@ THRESHOLD = 1.5
 """Of an inlier, in pixels of the picture in which the features were found."""
 REACH = 4.0
 """Pixels: matches that may obey a rival of the pose that was found, if not that one."""
+SHAKE = 16.0
+"""Pixels by which a camera that is meant to stand still may move its picture from one view to another."""
+SHAKEN_SHARE = 0.8
+"""Of a pose's inliers that one shift of the picture explains: from here on the camera is taken to have moved
+in its place. Around an object that it moves about, near and far parts shift differently."""
 LEAST_MATCHES = 16
 """Fewer are not trusted (see `trust`), whatever they say."""
 TURN = math.radians(30)
@@ -170,17 +175,37 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
     None where there are too few matches, or too few that any pose explains.
     """
     matches = match(first, second)
-    if first.strays and second.strays:
-        # Before a camera that stands still an object that turns moves, and what is around it does not; nor
-        # does a gripper before a camera in the hand. What stays where it was tells little in any other case.
-        shifts = np.linalg.norm(second.rays[matches[:, 1]] - first.rays[matches[:, 0]], axis=1)
-        matches = matches[shifts > THRESHOLD * math.sqrt(first.pixel * second.pixel)]
+    if not (first.strays and second.strays):
+        found = _explained(first, second, matches)
+        return None if found is None else found[0]
+    # Before a camera that stands still an object that turns moves, and what is around it does not; nor does a
+    # gripper before a camera in the hand. What stays where it was tells little in any other case.
+    shifts = second.rays[matches[:, 1]] - first.rays[matches[:, 0]]
+    shifts /= math.sqrt(first.pixel * second.pixel)
+    moves = np.linalg.norm(shifts, axis=1) > THRESHOLD
+    matches, shifts = matches[moves], shifts[moves]
+    found = _explained(first, second, matches)
+    if found is None:
+        return None
+    # A camera that shakes shifts all that stays by as much.
+    common = np.median(shifts[found[1]], axis=0)
+    shaken = np.linalg.norm(shifts - common, axis=1) < 2 * THRESHOLD
+    if np.linalg.norm(common) < SHAKE and shaken[found[1]].mean() > SHAKEN_SHARE:
+        found = _explained(first, second, matches[~shaken])
+    return None if found is None else found[0]
+
+
+def _explained(
+    first: LocalFeatures, second: LocalFeatures, matches: IntArray
+) -> tuple[Explanation, IntArray] | None:
+    """The poses that explain some matches, and the positions of those that obey the best."""
     if len(matches) < LEAST_MATCHES:
         return None
     # Of one object seen twice they do (weak geometric consistency: Jegou et al. 2008).
-    matches = matches[_alike(second.orientations[matches[:, 1]] - first.orientations[matches[:, 0]])]
-    if len(matches) < LEAST_MATCHES:
+    alike = _alike(second.orientations[matches[:, 1]] - first.orientations[matches[:, 0]])
+    if alike.sum() < LEAST_MATCHES:
         return None
+    positions, matches = np.flatnonzero(alike), matches[alike]
     rays_i, rays_j = homogeneous(first.rays[matches[:, 0]]), homogeneous(second.rays[matches[:, 1]])
     pixel = math.sqrt(first.pixel * second.pixel)
     found = _five_points(rays_i, rays_j, pixel)
@@ -206,11 +231,12 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
         extent(features.rays[inliers[:, view]]) / max(features.extent, 1e-12)
         for view, features in enumerate((first, second))
     )
-    return Explanation(
+    explanation = Explanation(
         stated,
         np.stack([first.places[inliers[:, 0]], second.places[inliers[:, 1]]], 1),
         Support(len(inliers), float(distances[inside].mean()) / pixel, spread),
     )
+    return explanation, positions[inside]
 
 
 def trust(support: Support) -> float:

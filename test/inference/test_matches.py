@@ -211,6 +211,28 @@ def test_a_static_background_takes_no_part(ball_on_a_turntable, rotation_of_ball
     assert degrees(misled.poses[0].rotation, np.eye(3)) < 3
 
 
+@pytest.mark.parametrize("shake", [0, 2, 4])
+def test_a_background_that_a_shaking_camera_shifts_says_nothing_either(
+    ball_on_a_turntable, rotation_of_ball, shake
+):
+    """The camera was meant to stand still: what is around the object shifts as one."""
+    views = [ball_on_a_turntable(turn, masked=False) for turn in (0, 20, 180)]
+    moved = [replace(view, image=np.roll(view.image, shake, (0, 1))) for view in views]
+    first, same, other = find_features(views[0]), find_features(moved[1]), find_features(moved[2])
+    found = relate(first, same)
+    assert degrees(found.poses[0].rotation, rotation_of_ball(20) @ rotation_of_ball(0).T) < 6
+    assert relate(first, other).probability == 0, "the other side: nothing else is in both"
+
+
+def test_a_camera_that_moves_a_little_around_an_object_is_no_shaking_one(point_scene):
+    """Five degrees: near and far parts of the object shift by some pixels more or less."""
+    scene = point_scene.ring([0, 5], points=200)
+    free = [replace(each, strays=True) for each in scene.features()]
+    found = relate(*free)
+    assert len(found.inliers) > 150
+    assert degrees(found.poses[0].rotation, scene.relative(0, 1)[0]) < 1
+
+
 @pytest.mark.parametrize(("bounded", "least", "most"), [(True, 0.5, 4), (False, 0.9, 3)])
 def test_without_a_mask_what_stays_in_place_says_nothing(
     ball_on_a_turntable, rotation_of_ball, bounded, least, most
