@@ -14,7 +14,8 @@ import numpy as np
 
 from relpose_ros.geometry import so3
 from relpose_ros.inference.local_features import find_features
-from relpose_ros.inference.matches import TRUST, explain
+from relpose_ros.inference.matches import TRUST
+from relpose_ros.inference.two_view_poses import explain
 
 if TYPE_CHECKING:
     import numpy.typing as npt

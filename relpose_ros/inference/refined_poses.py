@@ -12,7 +12,8 @@ import numpy as np
 
 from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.camera_positions import rows_of
-from relpose_ros.inference.matches import MATCHING_FLOOR, WIDENING, guessed_focal_covariance
+from relpose_ros.inference.matches import MATCHING_FLOOR, WIDENING
+from relpose_ros.inference.two_view_poses import guessed_focal_covariance
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

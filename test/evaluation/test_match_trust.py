@@ -9,7 +9,8 @@ from relpose_ros.captures.folder import Frame, load_capture, save_capture
 from relpose_ros.evaluation.match_trust import RIGHT, MatchedPairs, fit_trust, observe
 from relpose_ros.geometry import so3
 from relpose_ros.inference.local_features import find_features
-from relpose_ros.inference.matches import explain, relate, trust
+from relpose_ros.inference.matches import relate, trust
+from relpose_ros.inference.two_view_poses import explain
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
 FOCAL, SIDE = 300.0, 160

@@ -11,7 +11,8 @@ from relpose_ros.geometry import so3
 from relpose_ros.inference import bundle_adjustment
 from relpose_ros.inference.bundle_adjustment import LEAST_POINTS, _Observations, _Problem, _State, refine
 from relpose_ros.inference.local_features import match
-from relpose_ros.inference.matches import NOTHING, RelativePose, TwoViewGeometry
+from relpose_ros.inference.matches import NOTHING, TwoViewGeometry
+from relpose_ros.inference.two_view_poses import RelativePose
 
 ANGLES = [0.0, 20.0, 40.0, 60.0]
 

@@ -12,21 +12,11 @@ import torch
 from relpose_ros.captures.folder import load_capture
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import homogeneous
-from relpose_ros.inference import matches
+from relpose_ros.inference import matches, two_view_poses
 from relpose_ros.inference.local_features import LocalFeatures, find_features
-from relpose_ros.inference.matches import (
-    LEAST_MATCHES,
-    NOTHING,
-    Matcher,
-    RelativePose,
-    Support,
-    TwoViewGeometry,
-    explain,
-    peaks,
-    relate,
-    trust,
-)
+from relpose_ros.inference.matches import NOTHING, Matcher, TwoViewGeometry, peaks, relate, trust
 from relpose_ros.inference.outlines import Outline
+from relpose_ros.inference.two_view_poses import LEAST_MATCHES, RelativePose, Support, explain
 from relpose_ros.views import BoundingBox
 
 
@@ -430,7 +420,7 @@ def test_points_that_all_but_coincide_give_rotations_or_nothing(seed):
     rays_i = homogeneous(0.1 + 1e-4 * generator.standard_normal((40, 2)))
     rays_j = rays_i.copy()
     rays_j[:, :2] += 1e-4 * generator.standard_normal((40, 2))
-    poses = matches._of_plane(rays_i, rays_j, 1e-3)
+    poses = two_view_poses._of_plane(rays_i, rays_j, 1e-3)
     np.testing.assert_allclose(np.linalg.det(poses.rotations), 1, atol=1e-5)
     square = poses.rotations @ poses.rotations.transpose(0, 2, 1)
     np.testing.assert_allclose(square, np.broadcast_to(np.eye(3), square.shape), atol=1e-5)

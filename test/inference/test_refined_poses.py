@@ -10,8 +10,10 @@ import pytest
 from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.bundle_adjustment import refine
 from relpose_ros.inference.camera_positions import apart, joined
-from relpose_ros.inference.matches import NOTHING, RelativePose, TwoViewGeometry, match
+from relpose_ros.inference.local_features import match
+from relpose_ros.inference.matches import NOTHING, TwoViewGeometry
 from relpose_ros.inference.refined_poses import _informative, settle
+from relpose_ros.inference.two_view_poses import RelativePose
 
 ANGLES = [0.0, 20.0, 40.0, 60.0]
 BEFORE = np.diag([0.1**2] * 3 + [math.radians(5) ** 2] * 3)
