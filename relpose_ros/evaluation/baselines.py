@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from relpose_ros.estimates import ScanEstimate
     from relpose_ros.inference.estimator import Estimator
-    from relpose_ros.views import View
+    from relpose_ros.views import Intrinsics, View
 
     FloatArray = npt.NDArray[np.float64]
 
@@ -122,7 +122,7 @@ class Identity:
 class Colmap:
     """SIFT, exhaustive matching and incremental mapping by pycolmap, on whole images.
 
-    It gets what it can use: the intrinsics where they are known, and the mask where there is one
+    It gets what it can use: the intrinsics and the lens where they are known, and the mask where there is one
     (an object turned in front of a fixed camera has a background that contradicts its motion).
     Views missing from the largest reconstruction have no answer.
     """
@@ -163,10 +163,7 @@ class Colmap:
                 cv2.imwrite(str(masks / f"{name}.png"), view.mask.astype(np.uint8) * 255)
             reader = colmap.ImageReaderOptions(mask_path=str(masks) if view.mask is not None else "")
             if view.intrinsics is not None:
-                x0, y0 = view.origin
-                i = view.intrinsics
-                reader.camera_model = "PINHOLE"
-                reader.camera_params = f"{i.fx},{i.fy},{i.cx - x0},{i.cy - y0}"
+                reader.camera_model, reader.camera_params = colmap_camera(view, view.intrinsics)
             colmap.extract_features(
                 database,
                 images,
@@ -176,7 +173,11 @@ class Colmap:
                 device=colmap.Device.cpu,
             )
         colmap.match_exhaustive(database, device=colmap.Device.cpu)
-        options = colmap.IncrementalPipelineOptions(min_model_size=2, multiple_models=True)
+        # A calibrated lens is known better than a few views tell; refined, its eight numbers run away.
+        calibrated = any(view.distortion is not None for view in views)
+        options = colmap.IncrementalPipelineOptions(
+            min_model_size=2, multiple_models=True, ba_refine_extra_params=not calibrated
+        )
         models = colmap.incremental_mapping(database, images, folder / "models", options=options)
         if not models:
             return {}
@@ -186,3 +187,20 @@ class Colmap:
             for image in largest.images.values()
             if image.has_pose
         }
+
+
+def colmap_camera(view: View, intrinsics: Intrinsics) -> tuple[str, str]:
+    """The name and the parameters of COLMAP's camera model for a view's picture.
+
+    Of a lens it knows eight numbers; OpenCV's thin prisms and tilts are left out.
+    """
+    x0, y0 = view.origin
+    pinhole = (intrinsics.fx, intrinsics.fy, intrinsics.cx - x0, intrinsics.cy - y0)
+    lens = () if view.distortion is None else view.distortion.coefficients
+    if view.distortion is None:
+        model = "PINHOLE"
+    elif view.distortion.equidistant:
+        model = "OPENCV_FISHEYE"
+    else:
+        model, lens = "FULL_OPENCV", (*lens, *(0.0,) * 8)[:8]
+    return model, ",".join(str(float(number)) for number in (*pinhole, *lens))

@@ -15,10 +15,11 @@ from relpose_ros.evaluation.protocol import EvaluationError, PosedViews
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import look_at, translation_of
 from relpose_ros.inference.estimator import Estimator
+from relpose_ros.inference.outlines import rays_of
 from relpose_ros.inference.verdict import LARGEST_ROTATION_DEVIATION
 from relpose_ros.network.checkpoint import random_network, write_network
 from relpose_ros.network.presets import named_preset
-from relpose_ros.views import BoundingBox, View
+from relpose_ros.views import BoundingBox, Distortion, Intrinsics, View
 
 
 def posed(count=6, seed=0, name="thing"):
@@ -272,11 +273,19 @@ def test_only_photos_with_a_pose_are_measured_on(tmp_path):
         protocol.posed_views(save_capture(tmp_path / "lone", frames[:2]))
 
 
-def test_colmap_recovers_a_textured_scene():
+@pytest.mark.parametrize(
+    "lens",
+    [
+        None,
+        Distortion((-0.35, 0.12, 0.001, -0.001, 0.0)),
+        Distortion((0.3, -0.2, 0.0, 0.0), equidistant=True),
+    ],
+    ids=["pinhole", "plumb_bob", "equidistant"],
+)
+def test_colmap_recovers_a_textured_scene(lens):
     pytest.importorskip("pycolmap")
     cv2 = pytest.importorskip("cv2")
     from relpose_ros.evaluation.baselines import Colmap
-    from relpose_ros.views import Intrinsics
 
     # Two textured planes at an angle, drawn by their homographies.
     generator = np.random.default_rng(0)
@@ -302,9 +311,15 @@ def test_colmap_recovers_a_textured_scene():
             drawn = cv2.warpPerspective(texture, homography, (480, 360))
             inside = cv2.warpPerspective(np.ones((512, 512), np.uint8), homography, (480, 360))
             image[inside > 0] = drawn[inside > 0]
-        views.append(
-            View(image, BoundingBox(0, 0, 480, 360), 480, 360, intrinsics=Intrinsics(400, 400, 240, 180))
-        )
+        view = View(image, BoundingBox(0, 0, 480, 360), 480, 360, intrinsics=Intrinsics(400, 400, 240, 180))
+        if lens is not None:
+            # Where each pixel of the bent picture comes from.
+            columns, rows = np.meshgrid(np.arange(480) + 0.5, np.arange(360) + 0.5)
+            bent = np.stack([columns, rows], -1).reshape(-1, 2)
+            source = 400 * rays_of(replace(view, distortion=lens), bent) + [240 - 0.5, 180 - 0.5]
+            maps = source.astype(np.float32).reshape(360, 480, 2)
+            view = replace(view, image=cv2.remap(image, maps, None, cv2.INTER_CUBIC), distortion=lens)
+        views.append(view)
         rotations.append(rotation)
     estimate = Colmap().poses(views)
     for i, j in ((0, 1), (0, 2)):
