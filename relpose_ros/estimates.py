@@ -3,8 +3,8 @@
 Optical frames (x right, y down, z forward) and column vectors throughout: ``a_from_b`` maps
 coordinates in frame b to coordinates in frame a.
 
-The object frame has its origin at the point closest to all optical axes (RelPose++, section 3.3), as
-far as it is known, and the axes of the first view's optical frame. Unless the scale is known, its
+The object frame has its origin at the point closest to the cameras' lines of sight through the object's
+boxes, as far as it is known, and the axes of the first view's optical frame. Unless the scale is known, its
 unit of length is the distance from that origin to the first camera.
 """
 

@@ -16,7 +16,7 @@ import torch
 
 from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.global_rotations import solve
-from relpose_ros.inference.outlines import sighted_translations, sightlines
+from relpose_ros.inference.outlines import position_sigmas, sighted_translations, sightlines
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import PairEnergies
 from relpose_ros.inference.predictions import about_the_object
@@ -62,8 +62,8 @@ class Calibration:
     """Whether the boxes tell where cameras stand from the object (`outlines.sighted_translations`) better
     than the network's predicted translations do."""
     position_sigma: tuple[float, float] = (0.1, 0.2)
-    """Standard deviations of where a camera stands from the object, across its line of sight and along it, in
-    units of the first camera's distance, before matches tell more. The defaults are cautious."""
+    """Standard deviations of where a camera stands from the object before matches tell more, across its line
+    of sight and along it, in units of the first camera's distance. The defaults are cautious."""
     flat: float = 0.0
     """Share of the uniform distribution that is mixed in: how often the network is plainly wrong of a pair,
     as on photographs unlike its training images. Without it such a pair outvotes all else that is known."""
@@ -89,10 +89,9 @@ class Observation:
     energies: PairEnergies
     distributions: PairDistributions
     solutions: JointSolutions
+    outlines: tuple[Outline | None, ...]
     predicted: FloatArray
     """(N, 3) translations camera_from_object by the network, the first at distance 1."""
-    sighted: FloatArray
-    """(N, 3) the same by the boxes."""
     true_rotations: FloatArray
     """(N, 3, 3) camera_from_object, the first the identity."""
     true_translations: FloatArray
@@ -102,7 +101,7 @@ class Observation:
 
     def translations(self, calibration: Calibration) -> FloatArray:
         """(N, 3) what a calibration goes by."""
-        return self.sighted if calibration.placed_by_boxes else self.predicted
+        return sighted_translations(self.outlines) if calibration.placed_by_boxes else self.predicted
 
 
 @dataclass(frozen=True)
@@ -152,10 +151,10 @@ def observe(
         relative = truth[energies.j] @ truth[energies.i].mT
         at_truth = energies.at(torch.arange(energies.count), relative[:, None])[:, 0].double()
         solutions = solve(energies, distributions)
-    predicted = about_the_object(rotations, translations, seen)
-    sighted = sighted_translations(outlines)
+    predicted = about_the_object(rotations, translations, outlines)
     return Observation(
-        energies, distributions, solutions, predicted, sighted, rotations, about_object, at_truth
+        *(energies, distributions, solutions, tuple(outlines)),
+        *(predicted, rotations, about_object, at_truth),
     )
 
 
@@ -274,6 +273,7 @@ def _mahalanobis_squares(
                 observation.solutions.rotations[0],
                 translations,
                 calibration,
+                position_sigmas(observation.outlines, calibration.position_sigma),
             )
         rotations = observation.solutions.rotations[0].numpy()
         centres = cameras.camera_centre(rotations, translations)
@@ -314,7 +314,7 @@ def _position_sigma(observations: Sequence[Observation], calibration: Calibratio
         rays = translations / np.linalg.norm(translations, axis=1, keepdims=True)
         ahead = (errors * rays).sum(1)
         across.append(np.linalg.norm(errors - ahead[:, None] * rays, axis=1))
-        along.append(np.abs(ahead))
+        along.append(np.abs(ahead[1:]))  # the first camera's distance is the unit
     # In a plane the 90% quantile of the distance is 2.146 standard deviations, on a line 1.645.
     quantiles = [float(np.quantile(np.concatenate(parts), 0.9)) for parts in (across, along)]
     return quantiles[0] / 2.146, quantiles[1] / 1.645

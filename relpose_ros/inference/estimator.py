@@ -22,7 +22,12 @@ from relpose_ros.inference.camera_positions import apart, baseline, joined, plac
 from relpose_ros.inference.evidence import SHIPPED, EvidenceSettings
 from relpose_ros.inference.global_rotations import joint_scores, solve
 from relpose_ros.inference.matches import Matcher, peaks
-from relpose_ros.inference.outlines import find_outline, sighted_translations, sightlines
+from relpose_ros.inference.outlines import (
+    find_outline,
+    position_sigmas,
+    sighted_translations,
+    sightlines,
+)
 from relpose_ros.inference.pair_distribution import search
 from relpose_ros.inference.pair_energies import COARSE_LEVEL, GridEmbeddings, PairEnergies
 from relpose_ros.inference.predictions import (
@@ -292,7 +297,8 @@ class Estimator:
         solution = solve(found.tempered_energies, known).rotations[0]
         translations = self._translations(found, solution.numpy())
         covariances = camera_covariances(
-            found.distributions, found.energies, solution, translations, found.calibration
+            *(found.distributions, found.energies, solution, translations, found.calibration),
+            position_sigmas(found.outlines, found.calibration.position_sigma),
         )
         rotations, centres, joint = self._place(scan, found, solution.numpy(), translations, covariances)
         solution = torch.from_numpy(rotations)
@@ -314,11 +320,13 @@ class Estimator:
     def _regressed(self, scan: Scan) -> _Told:
         """What a network says that gives one pose a view, and no probability of it."""
         rotations, translations = regressed_poses(self._network, self._features(scan))
-        translations = about_the_object(rotations, translations, sightlines(_outlines(scan)))
+        outlines = _outlines(scan)
+        translations = about_the_object(rotations, translations, outlines)
+        sigmas = position_sigmas(outlines, Calibration().position_sigma)
         return _Told(
             rotations,
             cameras.camera_centre(rotations, translations),
-            joined(covariances_of_unknown_trust(rotations, translations, Calibration())),
+            joined(covariances_of_unknown_trust(rotations, translations, sigmas)),
             pairs_of_unknown_trust(rotations),
             score=0.0,
             verdict=(Verdict.ONE_MORE_VIEW, 0, WITHOUT_PROBABILITIES),
@@ -355,7 +363,7 @@ class Estimator:
         if found.calibration.placed_by_boxes:
             return sighted_translations(found.outlines)
         predicted = predicted_translations(self._network, found.features, rotations)
-        return about_the_object(rotations, predicted, sightlines(found.outlines))
+        return about_the_object(rotations, predicted, found.outlines)
 
     def _place(
         self,

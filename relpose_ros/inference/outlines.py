@@ -1,6 +1,6 @@
 """Where a camera sees the object, by the box around it.
 
-Image coordinates are rays (x / z, y / z) of the pinhole camera, as they were before a lens bent them.
+Rays are (x / z, y / z) of the pinhole camera, as they were before a lens bent them.
 """
 
 from __future__ import annotations
@@ -25,10 +25,16 @@ if TYPE_CHECKING:
 WIDEST_RAY = 20.0
 """Of a ray's coordinates, 87 degrees off the axis: so far out no calibration holds. OpenCV gives a million
 where it finds no ray that the lens would have bent to a pixel."""
+AHEAD = np.array([0.0, 0.0, 1.0])
 SIZE_SHARE = 0.5
 """Of the logarithm of an object's apparent size, what is due to the camera's distance: the rest is that an
 object has no two sides alike. Fitted on the photographs and renderings that the shipped network was trained
 on: the distances are 9 per cent off, and 11 were they taken for all the same."""
+UNSIGHTED_SIGMA = (0.1, 0.2)
+"""As `position_sigmas` has them, of a camera of which nobody says where in its picture the object is: a hand
+holds it within a few degrees of the middle, and at much the same distance."""
+GUESSED_FOCAL_DEVIATION = 0.2
+"""Relative standard deviation of a guessed focal length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,30 +42,37 @@ class Outline:
     """The object's box as a camera sees it."""
 
     middle: FloatArray
-    """(2,) ray."""
+    """(3,) unit vector in the camera's axes, right, down and ahead."""
     sides: FloatArray
-    """(2,) width and height, in units of rays."""
+    """(2,) angles, rad, that width and height take up; NaN where no rays are known of an edge."""
+    guessed: bool = False
+    """Whether the intrinsics are a guess."""
 
 
 def find_outline(view: View) -> Outline | None:
     """Of a view's box; its intrinsics are guessed from the size of the image where it has none.
 
-    None where the box is the whole picture, which says nothing of the object, or where no rays are known of
-    its corners.
+    None where the box is the whole picture, which says nothing of the object, or where no ray is known of its
+    middle. In angles an object looks alike wherever in the picture it is.
     """
     box = view.box
-    full = box.x0 <= 0 and box.y0 <= 0 and box.x1 >= view.full_width and box.y1 >= view.full_height
-    corners = rays_of(view, np.array([[box.x0, box.y0], [box.x1, box.y1]]))
-    if full or not known_rays(corners).all():
+    if box.x0 <= 0 and box.y0 <= 0 and box.x1 >= view.full_width and box.y1 >= view.full_height:
         return None
-    return Outline(corners.mean(0), corners[1] - corners[0])
+    x, y = (box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2
+    rays = rays_of(view, np.array([[box.x0, y], [box.x1, y], [x, box.y0], [x, box.y1], [x, y]]))
+    known = known_rays(rays)
+    edges, middle = np.split(_units(rays), [4])
+    if not known[4]:
+        return None
+    if not known.all():
+        return Outline(middle[0], np.full(2, np.nan), view.intrinsics is None)
+    across = np.clip((edges[0::2] * edges[1::2]).sum(1), -1, 1)
+    return Outline(_unit(edges.sum(0)), np.arccos(across), view.intrinsics is None)
 
 
 def sightlines(outlines: Sequence[Outline | None]) -> FloatArray:
     """Unit vectors towards the object in the cameras' axes; ahead where no box tells. -> (N, 3)."""
-    middles = [np.zeros(2) if outline is None else outline.middle for outline in outlines]
-    rays = homogeneous(np.array(middles))
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    return np.stack([AHEAD if outline is None else outline.middle for outline in outlines])
 
 
 def sighted_translations(outlines: Sequence[Outline | None]) -> FloatArray:
@@ -80,6 +93,29 @@ def sighted_translations(outlines: Sequence[Outline | None]) -> FloatArray:
     return np.asarray(distances[:, None] / distances[0] * sightlines(outlines))
 
 
+def position_sigmas(outlines: Sequence[Outline | None], sigma: tuple[float, float]) -> FloatArray:
+    """Standard deviations of where each camera stands from the object, across its line of sight and along it.
+
+    Args:
+        outlines: of the N views.
+        sigma: of a view whose box and intrinsics are known.
+
+    Returns:
+        (N, 2) in units of the first camera's distance.
+    """
+    sigmas = np.tile(np.asarray(sigma, np.float64), (len(outlines), 1))
+    for own, outline in zip(sigmas, outlines, strict=True):
+        if outline is None:
+            own[:] = np.maximum(own, UNSIGHTED_SIGMA)
+            continue
+        if not np.isfinite(outline.sides).all():
+            own[1] = max(own[1], UNSIGHTED_SIGMA[1])
+        if outline.guessed:
+            # A wrong focal length turns the line of sight in proportion to its angle from the axis.
+            own[0] = np.hypot(own[0], GUESSED_FOCAL_DEVIATION * np.arccos(outline.middle[2]))
+    return sigmas
+
+
 def focal_lengths(view: View) -> FloatArray:
     """Along x and y, pixels; guessed where the camera said nothing. -> (2,)."""
     intrinsics = _intrinsics(view)
@@ -96,6 +132,16 @@ def rays_of(view: View, pixels: FloatArray) -> FloatArray:
 def known_rays(rays: FloatArray) -> npt.NDArray[np.bool_]:
     """Which rays (K, 2) the lens's model tells."""
     return np.asarray((np.abs(rays) < WIDEST_RAY).all(1))
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _units(rays: FloatArray) -> FloatArray:
+    """Rays (K, 2) as unit vectors (K, 3)."""
+    points = homogeneous(rays)
+    return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True))
 
 
 def _intrinsics(view: View) -> Intrinsics:

@@ -13,15 +13,21 @@ import torch
 
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import camera_centre, closest_point_to_axes, in_world
+from relpose_ros.inference.outlines import sightlines
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy.typing as npt
 
+    from relpose_ros.inference.outlines import Outline
     from relpose_ros.network.features import SceneFeatures
     from relpose_ros.network.relpose import RelPose
 
     FloatArray = npt.NDArray[np.float64]
 
+WHERE_IT_WAS = 0.01
+"""How much the origin as predicted counts beside a line of sight, which is some ten times as exact."""
 LEAST_DISTANCE = 1e-6
 """Of a camera from the object's origin, in the network's unit: what is predicted may be anything."""
 
@@ -48,23 +54,28 @@ def predicted_translations(network: RelPose, features: SceneFeatures, rotations:
     return np.asarray(translations / max(float(np.linalg.norm(translations[0])), LEAST_DISTANCE))
 
 
-def about_the_object(rotations: FloatArray, translations: FloatArray, sightlines: FloatArray) -> FloatArray:
+def about_the_object(
+    rotations: FloatArray, translations: FloatArray, outlines: Sequence[Outline | None]
+) -> FloatArray:
     """The same cameras about the object, which need not be where their optical axes meet.
 
-    Each camera sees it along its line of sight, as far away as predicted; the mean of these places counts,
-    which holds where cameras stand close together, too.
+    The origin moves to the point closest to the lines of sight and, a hundredth as much, to where it was: so
+    that lines that are all but parallel leave it as far away as predicted.
 
     Args:
         rotations: (N, 3, 3) camera_from_object.
         translations: (N, 3) about where the axes meet.
-        sightlines: (N, 3) unit vectors towards the object, in the cameras' axes.
+        outlines: where the cameras see the object; None of one that does not tell.
 
     Returns:
         (N, 3), the first at distance 1.
     """
-    distances = np.linalg.norm(translations, axis=1, keepdims=True)
-    aside = in_world(rotations, distances * (sightlines - [0, 0, 1])).mean(0)
-    moved = translations + rotations @ aside
+    told = [camera for camera, outline in enumerate(outlines) if outline is not None]
+    rays = in_world(rotations, sightlines(outlines))[told]
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    wanted = (across @ camera_centre(rotations, translations)[told, :, None]).sum(0)
+    held = across.sum(0) + WHERE_IT_WAS * len(outlines) * np.eye(3)
+    moved = translations + rotations @ np.linalg.solve(held, wanted)[:, 0]
     return np.asarray(moved / max(float(np.linalg.norm(moved[0])), LEAST_DISTANCE))
 
 

@@ -17,7 +17,7 @@ from relpose_ros.geometry.cameras import homogeneous
 from relpose_ros.inference import epipolar
 from relpose_ros.inference.epipolar import Poses
 from relpose_ros.inference.local_features import extent, match
-from relpose_ros.inference.outlines import sighted_translations
+from relpose_ros.inference.outlines import GUESSED_FOCAL_DEVIATION, sighted_translations
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -33,10 +33,15 @@ THRESHOLD = 1.5
 REACH = 4.0
 """Pixels: matches that may obey a rival of the pose that was found, if not that one."""
 SHAKE = 64.0
-"""Pixels by which a camera that is meant to stand still may move its picture from one view to another."""
+"""By which a camera that is meant to stand still may shift the picture that features are found in, pixels."""
 SHAKEN_SHARE = 0.8
-"""Of a pose's inliers that one shift of the picture explains: from here on the camera is taken to have moved
-in its place. Around an object that it moves about, near and far parts shift differently."""
+"""Of a pose's inliers that one turn of the camera explains: from here on it is taken to have turned in its
+place. Around an object that it moves about, near and far parts shift differently."""
+SUSPECT_SHARE = 0.3
+"""The same, from which on the other matches are asked alone: a wall and an object that turns before it may
+both suit one pose, that of the wall."""
+TURNS_TRIED = 200
+"""Turns of a camera in its place, by two matches each: of a third of all one is hit thousands of times."""
 LEAST_MATCHES = 16
 """Fewer are not trusted (see `trust`), whatever they say."""
 TURN = math.radians(30)
@@ -44,9 +49,6 @@ TURN = math.radians(30)
 a slant of 60 degrees turns gradients by up to 20, those of accidental matches turn anyhow."""
 ITERATIONS = 1000
 """Of the robust estimator at most."""
-GUESSED_FOCAL_DEVIATION = 0.2
-"""Relative standard deviation of a guessed focal length. A rotation seen through a wrong one is wrong in
-proportion."""
 PLANAR_SHARE = 0.8
 """Of the matches, explained by one homography: from here on the points may lie on a plane, which two poses
 explain equally well, or the camera may only have turned."""
@@ -121,29 +123,64 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
         return _explained(first, second, matches)
     # Before a camera that stands still an object that turns moves, and what is around it does not; nor does a
     # gripper before a camera in the hand. What stays where it was tells little in any other case.
-    shifts = _shifts(first, second, matches)
-    moves = np.linalg.norm(shifts, axis=1) > THRESHOLD
-    matches, shifts = matches[moves], shifts[moves]
+    pixel = math.sqrt(first.pixel * second.pixel)
+    shifts = np.linalg.norm(second.rays[matches[:, 1]] - first.rays[matches[:, 0]], axis=1) / pixel
+    matches, shifts = matches[shifts > THRESHOLD], shifts[shifts > THRESHOLD]
     found = _explained(first, second, matches)
     if found is None:
         return None
-    # A camera that shakes shifts all that stays by as much.
-    of_inliers = _shifts(first, second, found.inliers)
-    common = np.median(of_inliers, axis=0)
-    if np.linalg.norm(common) > SHAKE or _near(of_inliers, common).mean() < SHAKEN_SHARE:
+    # A camera that shakes turns all that stays as one.
+    reach = 2 * THRESHOLD * pixel
+    directions = _directions(first, second, matches)
+    turn = _commonest_turn(directions, reach)
+    stays = _follow(turn, directions, reach)
+    if stays.sum() < LEAST_MATCHES or np.median(shifts[stays]) > SHAKE:
         return found
-    return _explained(first, second, matches[~_near(shifts, common)])
+    share = _follow(turn, _directions(first, second, found.inliers), reach).mean()
+    if share < SUSPECT_SHARE:
+        return found
+    rest = _explained(first, second, matches[~stays])
+    if share > SHAKEN_SHARE:
+        return rest
+    another = (
+        rest is not None
+        and so3.angle_between(rest.poses[0].rotation, found.poses[0].rotation) > SEPARATION
+        and len(rest.inliers) > (~stays).sum() / 2
+    )
+    return rest if another else found
 
 
-def _shifts(first: LocalFeatures, second: LocalFeatures, matches: IntArray) -> FloatArray:
-    """How far matched features are from each other in the pictures. (M, 2) -> (M, 2) pixels."""
-    rays = second.rays[matches[:, 1]] - first.rays[matches[:, 0]]
-    return np.asarray(rays / math.sqrt(first.pixel * second.pixel))
+_Directions = tuple["FloatArray", "FloatArray"]
+"""Unit vectors (M, 3) of matched features in camera i and in camera j."""
 
 
-def _near(shifts: FloatArray, common: FloatArray) -> npt.NDArray[np.bool_]:
-    """Which shifts (M, 2) may be one in truth."""
-    return np.asarray(np.linalg.norm(shifts - common, axis=1) < 2 * THRESHOLD)
+def _directions(first: LocalFeatures, second: LocalFeatures, matches: IntArray) -> _Directions:
+    of_i, of_j = homogeneous(first.rays[matches[:, 0]]), homogeneous(second.rays[matches[:, 1]])
+    return (
+        of_i / np.linalg.norm(of_i, axis=1, keepdims=True),
+        of_j / np.linalg.norm(of_j, axis=1, keepdims=True),
+    )
+
+
+def _follow(turn: FloatArray, directions: _Directions, reach: float) -> npt.NDArray[np.bool_]:
+    """Which matches a turn (..., 3, 3) of the camera in its place explains, to some angle. -> (..., M)."""
+    turned = directions[0] @ np.swapaxes(turn, -1, -2)
+    return np.asarray(np.linalg.norm(turned - directions[1], axis=-1) < reach)
+
+
+def _commonest_turn(directions: _Directions, reach: float) -> FloatArray:
+    """The turn of a camera in its place that explains the most matches, found by pairs of them. -> (3, 3)."""
+    drawn = np.random.default_rng(0).integers(0, len(directions[0]), (2, TURNS_TRIED))
+    frames = []
+    for own in directions:
+        first, second = own[drawn]
+        across = np.cross(first, second)
+        across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        frames.append(np.stack([first, across, np.cross(first, across)], -1))
+    turns = frames[1] @ frames[0].transpose(0, 2, 1)
+    following = _follow(turns, directions, reach)
+    of_best = following[following.sum(1).argmax()]
+    return so3.project(directions[1][of_best].T @ directions[0][of_best])
 
 
 def _explained(first: LocalFeatures, second: LocalFeatures, matches: IntArray) -> Explanation | None:
@@ -298,7 +335,7 @@ def _with_covariances(
 
 
 def guessed_focal_covariance(turn: FloatArray) -> FloatArray:
-    """What a guessed focal length adds to the covariance of a rotation: an error in proportion to the angle.
+    """What a guessed focal length adds to the covariance of a rotation, which it makes wrong in proportion.
 
     Args:
         turn: (3,) the rotation vector.

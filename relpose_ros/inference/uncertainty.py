@@ -329,6 +329,7 @@ def camera_covariances(
     solution: torch.Tensor,
     translations: FloatArray,
     calibration: Calibration,
+    sigmas: FloatArray,
 ) -> FloatArray:
     """Covariance of every camera in the object frame, as geometry_msgs/PoseWithCovariance orders it.
 
@@ -342,16 +343,17 @@ def camera_covariances(
         solution: (N, 3, 3) float64 camera_from_object.
         translations: (N, 3) camera_from_object, in units of the first camera's distance.
         calibration: of the network.
+        sigmas: (N, 2) of the translations, as `outlines.position_sigmas` has them.
 
     Returns:
         (N, 6, 6): x, y, z, rotation about X, Y, Z, fixed axes of the object frame.
     """
     spread = _joint_spread(distributions, energies, solution, calibration)
-    return _in_object_frame(spread, solution.numpy(), translations, calibration)
+    return _in_object_frame(spread, solution.numpy(), translations, sigmas)
 
 
 def covariances_of_unknown_trust(
-    rotations: FloatArray, translations: FloatArray, calibration: Calibration
+    rotations: FloatArray, translations: FloatArray, sigmas: FloatArray
 ) -> FloatArray:
     """As `camera_covariances`, of poses that came without a distribution.
 
@@ -360,23 +362,23 @@ def covariances_of_unknown_trust(
     Args:
         rotations: (N, 3, 3) camera_from_object.
         translations: (N, 3), as there.
-        calibration: whose ``position_sigma`` counts.
+        sigmas: (N, 2), as there.
     """
     spread = np.repeat(UNIFORM_VARIANCE * np.eye(3)[None], len(rotations), 0)
     spread[0] = 0
-    return _in_object_frame(spread, rotations, translations, calibration)
+    return _in_object_frame(spread, rotations, translations, sigmas)
 
 
 def _in_object_frame(
-    spread: FloatArray, rotations: FloatArray, translations: FloatArray, calibration: Calibration
+    spread: FloatArray, rotations: FloatArray, translations: FloatArray, sigmas: FloatArray
 ) -> FloatArray:
     """Covariances (N, 6, 6) of poses from those of their rotations, (N, 3, 3) in the cameras' own axes."""
     spread = spread + SOLVER_FLOOR**2 * np.eye(3)
-    across, along = calibration.position_sigma
-    rays = translations / np.linalg.norm(translations, axis=1, keepdims=True)
-    shifts = across**2 * np.eye(3) + (along**2 - across**2) * rays[:, :, None] * rays[:, None, :]
+    across, along = np.square(sigmas).T[..., None, None]
     # By definition of the unit of length the first camera's distance is one.
-    shifts[0] += (SOLVER_FLOOR**2 - along**2) * np.outer(rays[0], rays[0])
+    along[0] = SOLVER_FLOOR**2
+    rays = translations / np.maximum(np.linalg.norm(translations, axis=1, keepdims=True), 1e-9)
+    shifts = across * np.eye(3) + (along - across) * rays[:, :, None] * rays[:, None, :]
     covariances = np.zeros((len(rotations), 6, 6))
     for camera, object_from_camera in enumerate(rotations.transpose(0, 2, 1)):
         # A turn e of the camera (axes of the camera, left perturbation of camera_from_object) is the turn

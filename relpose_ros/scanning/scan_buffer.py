@@ -408,8 +408,9 @@ class ScanBuffer:
 
 
 def viewing_directions(estimate: ScanEstimate) -> FloatArray:
-    """The optical axes in the object frame, (N, 3)."""
-    return np.stack([camera.object_from_camera[:, 2] for camera in estimate.cameras])
+    """From the cameras to the object, unit vectors in its frame, (N, 3). A camera that pans keeps its own."""
+    positions = np.stack([camera.position for camera in estimate.cameras])
+    return np.asarray(-positions / np.maximum(np.linalg.norm(positions, axis=1, keepdims=True), 1e-9))
 
 
 def nearest_angles(directions: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from relpose_ros.inference import bundle_adjustment, matches
 from relpose_ros.inference.bundle_adjustment import Refined
 from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.estimator import OWN_THREADS, Estimator, EvidenceSettings, ScanError
-from relpose_ros.inference.outlines import find_outline, sighted_translations, sightlines
+from relpose_ros.inference.outlines import find_outline, sighted_translations
 from relpose_ros.inference.predictions import about_the_object, predicted_translations, regressed_poses
 from relpose_ros.network.checkpoint import random_network, write_network
 from relpose_ros.network.features import SceneFeatures
@@ -245,8 +245,8 @@ def test_a_network_that_predicts_in_the_first_cameras_frame_gives_the_same_objec
 
 
 @pytest.mark.parametrize("by_boxes", [True, False])
-def test_the_origin_is_where_the_boxes_are(by_boxes):
-    """A calibration chooses what places the cameras; either way each sees the origin in its box."""
+def test_a_calibration_chooses_what_places_the_cameras(by_boxes):
+    """Either way the object is the origin: boxes, or predictions moved to where the boxes see it."""
     views = Scan(
         "mug",
         tuple(
@@ -262,7 +262,7 @@ def test_the_origin_is_where_the_boxes_are(by_boxes):
     expected = sighted_translations(outlines)
     if not by_boxes:
         predicted = predicted_translations(estimator._network, estimator.features(views), rotations)
-        expected = about_the_object(rotations, predicted, sightlines(outlines))
+        expected = about_the_object(rotations, predicted, outlines)
     np.testing.assert_allclose(translations, expected, atol=1e-9)
     assert np.linalg.norm(translations[0]) == pytest.approx(1)
 

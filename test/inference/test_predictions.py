@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relpose_ros.geometry import cameras, so3
+from relpose_ros.inference.outlines import Outline
 from relpose_ros.inference.predictions import about_the_object, predicted_translations, regressed_poses
 from relpose_ros.network.checkpoint import random_network
 from relpose_ros.network.presets import named_preset
@@ -44,6 +45,11 @@ def scan(seed, views):
     return rotations @ rotations[0].T, generator.normal(size=(views, 3)) * 0.3 + [0, 0, 5.0]
 
 
+def boxed(seen):
+    """The outlines of an object at some places in the cameras' axes. (N, 3)."""
+    return [Outline(place / np.linalg.norm(place), np.full(2, 0.3)) for place in seen]
+
+
 @given(seed=st.integers(0, 10_000), views=st.integers(2, 8))
 @settings(max_examples=20, deadline=None)
 def test_poses_are_the_same_whichever_origin_they_were_learned_about(seed, views):
@@ -63,25 +69,28 @@ def test_poses_are_the_same_whichever_origin_they_were_learned_about(seed, views
 
 def test_the_origin_is_moved_to_where_the_cameras_see_the_object():
     """Their axes meet beside it: everything is where it was but for the origin and the unit."""
-    generator = np.random.default_rng(0)
-    rotations = so3.random_rotations(6, generator)
+    rotations = so3.random_rotations(6, np.random.default_rng(0))
     rotations = rotations @ rotations[0].T
-    object_at = np.array([0.05, -0.1, 0.02])
     translations = np.tile([0.0, 0, 1], (6, 1))
-    seen = translations + rotations @ object_at
-    sightlines = seen / np.linalg.norm(seen, axis=1, keepdims=True)
-    moved = about_the_object(rotations, translations, sightlines)
+    seen = translations + rotations @ [0.2, -0.25, 0.1]
+    moved = about_the_object(rotations, translations, boxed(seen))
     assert np.linalg.norm(moved[0]) == pytest.approx(1)
-    # Distances to the object are not quite those to where the axes meet: to second order it is exact.
-    np.testing.assert_allclose(moved, seen / np.linalg.norm(seen[0]), atol=0.04)
-    still = np.linalg.norm(translations / np.linalg.norm(seen[0]) - seen / np.linalg.norm(seen[0]), axis=1)
-    assert still.min() > 0.1, "as predicted it is further off"
+    np.testing.assert_allclose(moved, seen / np.linalg.norm(seen[0]), atol=0.01)
 
 
-def test_cameras_that_look_straight_at_the_object_stay_where_they_are():
+def test_from_cameras_close_together_the_object_stays_as_far_away_as_predicted():
+    """Their lines of sight meet anywhere: a degree of error would move the origin by half the distance."""
+    rotations = so3.exp(np.radians([[0, 0, 0], [0, 2, 0]]))
+    translations = np.tile([0.0, 0, 1], (2, 1))
+    seen = np.array([[0.1, 0, 1], [0.1 + np.radians(1), 0, 1]])
+    moved = about_the_object(rotations, translations, boxed(seen))
+    np.testing.assert_allclose(moved[:, 2], 1, atol=0.05)
+    np.testing.assert_allclose(moved[:, 0], 0.1, atol=0.02)
+
+
+def test_cameras_of_which_no_box_tells_stay_as_predicted():
     rotations, translations = scan(3, 5)
-    ahead = np.tile([0.0, 0, 1], (5, 1))
-    same = about_the_object(rotations, translations, ahead)
+    same = about_the_object(rotations, translations, [None] * 5)
     np.testing.assert_allclose(same, translations / np.linalg.norm(translations[0]), atol=1e-12)
 
 

@@ -39,8 +39,9 @@ def told(scene, calibration=UNCALIBRATED, translations=None):
         distributions = search(energies, GridEmbeddings(scene))
         solutions = solve(energies, distributions)
         pairs = describe_pairs(distributions, energies, solutions.rotations[0], calibration)
+        sigmas = np.tile(calibration.position_sigma, (len(scene), 1))
         covariances = camera_covariances(
-            distributions, energies, solutions.rotations[0], translations, calibration
+            distributions, energies, solutions.rotations[0], translations, calibration, sigmas
         )
     return pairs, covariances, solutions.rotations[0].numpy()
 
@@ -169,7 +170,14 @@ def test_two_groups_tied_by_matches_know_each_other_as_one_pair_would(fisher_sce
         distributions = search(energies, GridEmbeddings(scene))
         solution = torch.from_numpy(scene.cameras)
         pairs = describe_pairs(distributions, energies, solution, UNCALIBRATED)
-        covariances = camera_covariances(distributions, energies, solution, translations, UNCALIBRATED)
+        covariances = camera_covariances(
+            distributions,
+            energies,
+            solution,
+            translations,
+            UNCALIBRATED,
+            np.full((len(translations), 2), 0.1),
+        )
         variances = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2) / 3
         across = np.mean([np.trace(pair.covariance) / 3 for pair in pairs if pair.i < 2 <= pair.j])
         np.testing.assert_allclose(variances[2:], across, rtol=0.1)
