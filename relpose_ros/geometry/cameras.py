@@ -24,6 +24,12 @@ def homogeneous(rays: npt.ArrayLike) -> FloatArray:
     return np.concatenate([r, np.ones_like(r[..., :1])], -1)
 
 
+def directions(rays: npt.ArrayLike) -> FloatArray:
+    """Rays (x / z, y / z) as unit vectors. (..., 2) -> (..., 3)."""
+    points = homogeneous(rays)
+    return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True))
+
+
 def camera_centre(camera_from_world: npt.ArrayLike, translation: npt.ArrayLike) -> FloatArray:
     """Where the camera stands in the world: ``-R^T t``. (..., 3, 3), (..., 3) -> (..., 3)."""
     return -in_world(camera_from_world, translation)
@@ -35,9 +41,9 @@ def translation_of(camera_from_world: npt.ArrayLike, centre: npt.ArrayLike) -> F
     return np.asarray(-np.einsum("...ij,...j->...i", r, c))
 
 
-def in_world(camera_from_world: npt.ArrayLike, directions: npt.ArrayLike) -> FloatArray:
+def in_world(camera_from_world: npt.ArrayLike, local: npt.ArrayLike) -> FloatArray:
     """Directions in the cameras' axes as the world has them: ``R^T d``. (..., 3, 3), (..., 3) -> (..., 3)."""
-    r, d = np.asarray(camera_from_world, np.float64), np.asarray(directions, np.float64)
+    r, d = np.asarray(camera_from_world, np.float64), np.asarray(local, np.float64)
     return np.asarray(np.einsum("...ji,...j->...i", r, d))
 
 
@@ -75,15 +81,15 @@ def project_points(
     return np.stack([u, v], -1)
 
 
-def closest_point_to_rays(directions: npt.ArrayLike, centres: npt.ArrayLike) -> FloatArray:
+def closest_point_to_rays(rays: npt.ArrayLike, centres: npt.ArrayLike) -> FloatArray:
     """The point with the least summed squared distance to the lines through the camera centres.
 
     Unit directions (..., N, 3) in the world and centres (..., N, 3) -> (..., 3). Parallel lines leave it free
     along themselves: there the answer is the point nearest to the mean of the camera centres.
     """
-    rays, c = np.asarray(directions, np.float64), np.asarray(centres, np.float64)
+    r, c = np.asarray(rays, np.float64), np.asarray(centres, np.float64)
     middle = c.mean(-2)
-    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]  # keeps what is perpendicular to the ray
+    across = np.eye(3) - r[..., :, None] * r[..., None, :]  # keeps what is perpendicular to the ray
     wanted = (across @ (c - middle[..., None, :])[..., None]).sum(-3)
     offset = np.linalg.pinv(across.sum(-3), rcond=1e-9, hermitian=True) @ wanted
     return np.asarray(middle + offset[..., 0])

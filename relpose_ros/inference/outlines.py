@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from relpose_ros.geometry.cameras import homogeneous
+from relpose_ros.geometry import cameras
 from relpose_ros.views import Intrinsics
 
 if TYPE_CHECKING:
@@ -61,13 +61,14 @@ def find_outline(view: View) -> Outline | None:
     x, y = (box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2
     rays = rays_of(view, np.array([[box.x0, y], [box.x1, y], [x, box.y0], [x, box.y1], [x, y]]))
     known = known_rays(rays)
-    edges, middle = np.split(_units(rays), [4])
+    edges, middle = np.split(cameras.directions(rays), [4])
     if not known[4]:
         return None
     if not known.all():
         return Outline(middle[0], np.full(2, np.nan), view.intrinsics is None)
     across = np.clip((edges[0::2] * edges[1::2]).sum(1), -1, 1)
-    return Outline(_unit(edges.sum(0)), np.arccos(across), view.intrinsics is None)
+    together = edges.sum(0)
+    return Outline(together / np.linalg.norm(together), np.arccos(across), view.intrinsics is None)
 
 
 def sightlines(outlines: Sequence[Outline | None]) -> FloatArray:
@@ -132,16 +133,6 @@ def rays_of(view: View, pixels: FloatArray) -> FloatArray:
 def known_rays(rays: FloatArray) -> npt.NDArray[np.bool_]:
     """Which rays (K, 2) the lens's model tells."""
     return np.asarray((np.abs(rays) < WIDEST_RAY).all(1))
-
-
-def _unit(vector: FloatArray) -> FloatArray:
-    return np.asarray(vector / np.linalg.norm(vector))
-
-
-def _units(rays: FloatArray) -> FloatArray:
-    """Rays (K, 2) as unit vectors (K, 3)."""
-    points = homogeneous(rays)
-    return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True))
 
 
 def _intrinsics(view: View) -> Intrinsics:

@@ -18,6 +18,7 @@ from relpose_ros.inference import epipolar
 from relpose_ros.inference.epipolar import Poses
 from relpose_ros.inference.local_features import extent, match
 from relpose_ros.inference.outlines import GUESSED_FOCAL_DEVIATION, sighted_translations
+from relpose_ros.inference.turns_in_place import commonest_turn, directions_of, follows
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -40,8 +41,6 @@ place. Around an object that it moves about, near and far parts shift differentl
 SUSPECT_SHARE = 0.3
 """The same, from which on the other matches are asked alone: a wall and an object that turns before it may
 both suit one pose, that of the wall."""
-TURNS_TRIED = 200
-"""Turns of a camera in its place, by two matches each: of a third of all one is hit thousands of times."""
 LEAST_MATCHES = 16
 """Fewer are not trusted (see `trust`), whatever they say."""
 TURN = math.radians(30)
@@ -131,12 +130,12 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
         return None
     # A camera that shakes turns all that stays as one.
     reach = 2 * THRESHOLD * pixel
-    directions = _directions(first, second, matches)
-    turn = _commonest_turn(directions, reach)
-    stays = _follow(turn, directions, reach)
+    directions = directions_of(first, second, matches)
+    turn = commonest_turn(directions, reach)
+    stays = follows(turn, directions, reach)
     if stays.sum() < LEAST_MATCHES or np.median(shifts[stays]) > SHAKE:
         return found
-    share = _follow(turn, _directions(first, second, found.inliers), reach).mean()
+    share = follows(turn, directions_of(first, second, found.inliers), reach).mean()
     if share < SUSPECT_SHARE:
         return found
     rest = _explained(first, second, matches[~stays])
@@ -148,39 +147,6 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
         and len(rest.inliers) > (~stays).sum() / 2
     )
     return rest if another else found
-
-
-_Directions = tuple["FloatArray", "FloatArray"]
-"""Unit vectors (M, 3) of matched features in camera i and in camera j."""
-
-
-def _directions(first: LocalFeatures, second: LocalFeatures, matches: IntArray) -> _Directions:
-    of_i, of_j = homogeneous(first.rays[matches[:, 0]]), homogeneous(second.rays[matches[:, 1]])
-    return (
-        of_i / np.linalg.norm(of_i, axis=1, keepdims=True),
-        of_j / np.linalg.norm(of_j, axis=1, keepdims=True),
-    )
-
-
-def _follow(turn: FloatArray, directions: _Directions, reach: float) -> npt.NDArray[np.bool_]:
-    """Which matches a turn (..., 3, 3) of the camera in its place explains, to some angle. -> (..., M)."""
-    turned = directions[0] @ np.swapaxes(turn, -1, -2)
-    return np.asarray(np.linalg.norm(turned - directions[1], axis=-1) < reach)
-
-
-def _commonest_turn(directions: _Directions, reach: float) -> FloatArray:
-    """The turn of a camera in its place that explains the most matches, found by pairs of them. -> (3, 3)."""
-    drawn = np.random.default_rng(0).integers(0, len(directions[0]), (2, TURNS_TRIED))
-    frames = []
-    for own in directions:
-        first, second = own[drawn]
-        across = np.cross(first, second)
-        across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-        frames.append(np.stack([first, across, np.cross(first, across)], -1))
-    turns = frames[1] @ frames[0].transpose(0, 2, 1)
-    following = _follow(turns, directions, reach)
-    of_best = following[following.sum(1).argmax()]
-    return so3.project(directions[1][of_best].T @ directions[0][of_best])
 
 
 def _explained(first: LocalFeatures, second: LocalFeatures, matches: IntArray) -> Explanation | None:
