@@ -314,6 +314,7 @@ class Estimator:
                 apart(joint),
                 self._calibration is not None,
                 guessed=any(view.intrinsics is None for view in scan.views),
+                seen=sightlines(found.outlines),
             ),
         )
 

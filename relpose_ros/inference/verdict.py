@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relpose_ros.estimates import Evidence, Verdict
-from relpose_ros.geometry import so3
+from relpose_ros.inference.outlines import AHEAD
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,7 +28,8 @@ CONTRADICTION_ANGLE = math.radians(10)
 LARGEST_ROTATION_DEVIATION = math.radians(12)
 """Largest standard deviation (worst axis) of a camera's rotation: within 15 degrees more often than not."""
 SAME_PLACE = math.radians(3)
-"""Two views of a trusted pair that is turned by less are one: a picture taken twice repeats its mistakes."""
+"""Two views of a trusted pair whose lines of sight differ by less are one: a picture taken twice repeats its
+mistakes."""
 ONE_MORE = "one more view: "
 NOT_ENOUGH = "not enough: "
 WITHOUT_ROOM = {
@@ -58,6 +59,7 @@ def judge(
     calibrated: bool,
     *,
     guessed: bool = False,
+    seen: npt.NDArray[np.float64] | None = None,
 ) -> tuple[Verdict, int, str]:
     """The verdict, the weakest pair's position and the verdict in words.
 
@@ -74,11 +76,14 @@ def judge(
         covariances: (N, 6, 6) of the cameras.
         calibrated: whether the probabilities were calibrated.
         guessed: whether a view's focal length is a guess.
+        seen: (N, 3) unit vectors towards the object in the cameras' axes; None for straight ahead. A camera
+            that only pans or rolls has not left its place.
     """
     deviations = rotation_deviations(covariances)
+    seen = np.tile(AHEAD, (len(covariances), 1)) if seen is None else seen
     tied = _tied(pairs, len(covariances))
     trusted = [p for p, pair in enumerate(pairs) if pair.solution_probability >= TRUSTED_PROBABILITY]
-    if all(tied) and (unchecked := _unchecked(pairs, trusted)) is not None:
+    if all(tied) and (unchecked := _unchecked(pairs, trusted, seen)) is not None:
         bridge, views = unchecked
         hangs = f"view {views[0]} hangs" if len(views) == 1 else f"views {_listed(views)} hang"
         pair = pairs[bridge]
@@ -159,13 +164,15 @@ def _chains(pairs: Sequence[PairRotation], views: int) -> list[list[int]]:
     return [chain or [] for chain in chains]
 
 
-def _unchecked(pairs: Sequence[PairRotation], trusted: Sequence[int]) -> tuple[int, list[int]] | None:
+def _unchecked(
+    pairs: Sequence[PairRotation], trusted: Sequence[int], seen: npt.NDArray[np.float64]
+) -> tuple[int, list[int]] | None:
     """A trusted pair without which the trusted ones tie not all views together, and the views of its far end.
 
     Pairs between the same two places are one. The least certain of such pairs. Its far end is the smaller
     one; of two as large, the one without view 0.
     """
-    repeated = [pairs[p] for p in trusted if _turn(pairs[p]) < SAME_PLACE]
+    repeated = [pairs[p] for p in trusted if _around_the_object(pairs[p], seen) < SAME_PLACE]
     places = [frozenset(min(_reached(view, repeated)) for view in (pairs[p].i, pairs[p].j)) for p in trusted]
     found = []
     for bridge, ends in zip(trusted, places, strict=True):
@@ -178,8 +185,10 @@ def _unchecked(pairs: Sequence[PairRotation], trusted: Sequence[int]) -> tuple[i
     return min(found)[1:] if found else None
 
 
-def _turn(pair: PairRotation) -> float:
-    return float(so3.angle_between(pair.camera_j_from_camera_i, np.eye(3)))
+def _around_the_object(pair: PairRotation, seen: npt.NDArray[np.float64]) -> float:
+    """Angle between the two cameras' lines of sight to the object, rad."""
+    cosine = seen[pair.i] @ pair.camera_j_from_camera_i.T @ seen[pair.j]
+    return float(np.arccos(np.clip(cosine, -1, 1)))
 
 
 def _reached(view: int, pairs: Sequence[PairRotation]) -> set[int]:

@@ -347,6 +347,21 @@ def test_two_groups_that_one_pair_ties_are_not_enough(fisher_scene, cameras_arou
     assert judge(pairs, covariances, calibrated=True)[0] is Verdict.ENOUGH
 
 
+@pytest.mark.parametrize("turn_deg", [(0, 25, 0), (0, 0, 90)], ids=["pans", "rolls"])
+def test_a_camera_that_turns_in_its_place_checks_nothing(fisher_scene, cameras_around, turn_deg):
+    two = cameras_around(2, 3)
+    turn = so3.exp(np.radians(turn_deg))
+    scene = fisher_scene(np.stack([*two, turn @ two[1]]), concentration=300.0)
+    pairs, covariances, _ = told(scene)
+    ahead = np.array([0.0, 0, 1])
+    seen = np.stack([ahead, ahead, turn @ ahead])
+    verdict, _, words = judge(pairs, covariances, True, seen=seen)
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert "which no other pair checks" in words
+    elsewhere = np.stack([ahead, ahead, so3.exp(np.radians([15, 0, 0])) @ turn @ ahead])
+    assert judge(pairs, covariances, True, seen=elsewhere)[0] is Verdict.ENOUGH
+
+
 def test_contradicting_pairs_are_not_enough(fisher_scene, cameras_around):
     """Three sharp pairs around a loop that does not close."""
     scene = fisher_scene(cameras_around(3, 9), concentration=100.0)
