@@ -81,17 +81,19 @@ def project_points(
     return np.stack([u, v], -1)
 
 
-def closest_point_to_rays(rays: npt.ArrayLike, centres: npt.ArrayLike) -> FloatArray:
+def closest_point_to_rays(rays: npt.ArrayLike, centres: npt.ArrayLike, held: float = 0.0) -> FloatArray:
     """The point with the least summed squared distance to the lines through the camera centres.
 
     Unit directions (..., N, 3) in the world and centres (..., N, 3) -> (..., 3). Parallel lines leave it free
-    along themselves: there the answer is the point nearest to the mean of the camera centres.
+    along themselves: there the answer is the point nearest to the mean of the camera centres. The squared
+    distance to the world's origin counts ``held`` times as much as one to a line.
     """
     r, c = np.asarray(rays, np.float64), np.asarray(centres, np.float64)
     middle = c.mean(-2)
     across = np.eye(3) - r[..., :, None] * r[..., None, :]  # keeps what is perpendicular to the ray
     wanted = (across @ (c - middle[..., None, :])[..., None]).sum(-3)
-    offset = np.linalg.pinv(across.sum(-3), rcond=1e-9, hermitian=True) @ wanted
+    wanted = wanted - held * middle[..., None]
+    offset = np.linalg.pinv(across.sum(-3) + held * np.eye(3), rcond=1e-9, hermitian=True) @ wanted
     return np.asarray(middle + offset[..., 0])
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from relpose_ros.geometry import so3
-from relpose_ros.geometry.cameras import camera_centre, closest_point_to_axes, in_world
+from relpose_ros.geometry.cameras import camera_centre, closest_point_to_axes, closest_point_to_rays, in_world
 from relpose_ros.inference.outlines import sightlines
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def predicted_translations(network: RelPose, features: SceneFeatures, rotations:
     if network.preset.translation_frame == "first_camera":
         origin = closest_point_to_axes(rotations, camera_centre(rotations, translations))
         translations = translations + rotations @ origin
-    return np.asarray(translations / max(float(np.linalg.norm(translations[0])), LEAST_DISTANCE))
+    return _first_at_one(translations)
 
 
 def about_the_object(
@@ -71,12 +71,16 @@ def about_the_object(
         (N, 3), the first at distance 1.
     """
     told = [camera for camera, outline in enumerate(outlines) if outline is not None]
+    if not told:
+        return _first_at_one(translations)
     rays = in_world(rotations, sightlines(outlines))[told]
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    wanted = (across @ camera_centre(rotations, translations)[told, :, None]).sum(0)
-    held = across.sum(0) + WHERE_IT_WAS * len(outlines) * np.eye(3)
-    moved = translations + rotations @ np.linalg.solve(held, wanted)[:, 0]
-    return np.asarray(moved / max(float(np.linalg.norm(moved[0])), LEAST_DISTANCE))
+    centres = camera_centre(rotations, translations)[told]
+    origin = closest_point_to_rays(rays, centres, WHERE_IT_WAS * len(outlines))
+    return _first_at_one(translations + rotations @ origin)
+
+
+def _first_at_one(translations: FloatArray) -> FloatArray:
+    return np.asarray(translations / max(float(np.linalg.norm(translations[0])), LEAST_DISTANCE))
 
 
 @torch.no_grad()
