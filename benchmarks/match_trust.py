@@ -1,6 +1,6 @@
 """How far matches are to be trusted: the constants of `relpose_ros.inference.matches`, fitted on captures.
 
-    python -m benchmarks.match_trust CAPTURE... [--boxes]
+    python -m benchmarks.match_trust CAPTURE... [--boxes] [--sift-alone]
 
 Matches all pairs of each capture's photographs whose pose is known, with their masks where there are some.
 """
@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from relpose_ros.captures.folder import load_capture
 from relpose_ros.evaluation.match_trust import MatchedPairs, fit_trust, observe
+from relpose_ros.inference.estimator import Estimator
 
 FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0)
 FLOORS_DEG = (0.1, 0.2, 0.3, 0.5, 0.7)
@@ -35,16 +36,24 @@ def main() -> None:
     )
     parser.add_argument("captures", type=Path, nargs="*", help="capture folders with poses")
     parser.add_argument("--boxes", action="store_true", help="leave masks aside")
+    parser.add_argument("--sift-alone", action="store_true", help="without the shipped network's descriptors")
     arguments = parser.parse_args()
     if not arguments.captures:
         print("Nothing to fit: name captures with poses.")
         return
-    parts = [observe(load_capture(each), masked=not arguments.boxes) for each in tqdm(arguments.captures)]
+    estimator = None if arguments.sift_alone else Estimator.from_weights()
+    parts = [
+        observe(load_capture(each), estimator, masked=not arguments.boxes)
+        for each in tqdm(arguments.captures)
+    ]
     pairs = MatchedPairs(
         *(np.concatenate(column) for column in zip(*(vars(p).values() for p in parts), strict=True))
     )
     print(f"{len(pairs.right)} matched pairs, {pairs.right.mean():.0%} right")
-    print("TRUST =", tuple(float(value) for value in fit_trust(pairs).round(2)))
+    print(
+        "TRUST =" if arguments.sift_alone else "LEARNED_TRUST =",
+        tuple(float(value) for value in fit_trust(pairs).round(2)),
+    )
     print("log likelihood of the errors, by factor (down) and floor in degrees (across)")
     print(" " * 6 + "".join(f"{floor:8.1f}" for floor in FLOORS_DEG))
     for factor in FACTORS:

@@ -1,6 +1,6 @@
 """Fits how far matches are to be trusted, on captures whose poses are known.
 
-`benchmarks/match_trust.py` prints what stands in `relpose_ros.inference.matches`: the logistic regression of
+`benchmarks/match_trust.py` prints what stands in `relpose_ros.inference.matches`: the logistic regressions of
 `trust`, and the two numbers by which the covariance of a matched rotation is widened.
 """
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from relpose_ros.captures.folder import Capture
+    from relpose_ros.inference.estimator import Estimator
 
     FloatArray = npt.NDArray[np.float64]
 
@@ -44,10 +45,17 @@ class MatchedPairs:
     """(R, 3, 3) that they stated."""
 
 
-def observe(capture: Capture, *, masked: bool) -> MatchedPairs:
-    """Match every pair of a capture's posed photos."""
+def observe(capture: Capture, estimator: Estimator | None = None, *, masked: bool) -> MatchedPairs:
+    """Match every pair of a capture's posed photos.
+
+    Args:
+        capture: folder of photos.
+        estimator: whose network speaks beside SIFT; None for SIFT alone.
+        masked: whether the masks on file count.
+    """
     photos = [k for k, photo in enumerate(capture.photos) if photo.camera_from_world is not None]
-    features = [find_features(capture.view(k, masked=masked)) for k in photos]
+    views = [capture.view(k, masked=masked) for k in photos]
+    features = [find_features(view, None if estimator is None else estimator.places(view)) for view in views]
     rotations = [np.asarray(capture.photos[k].camera_from_world)[:, :3] for k in photos]
     signs, right, errors, covariances = [], [], [], []
     for i in range(len(photos)):

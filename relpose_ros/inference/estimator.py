@@ -21,6 +21,7 @@ from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.camera_positions import apart, baseline, joined, place
 from relpose_ros.inference.evidence import SHIPPED, EvidenceSettings
 from relpose_ros.inference.global_rotations import joint_scores, solve
+from relpose_ros.inference.local_features import DescriptorMap
 from relpose_ros.inference.matches import Matcher, peaks
 from relpose_ros.inference.outlines import (
     find_outline,
@@ -48,12 +49,12 @@ from relpose_ros.inference.uncertainty import (
 )
 from relpose_ros.inference.verdict import WITHOUT_PROBABILITIES, judge
 from relpose_ros.network.checkpoint import load_network, read_metadata
-from relpose_ros.network.crops import crop_view
+from relpose_ros.network.crops import crop_square, crop_view
 from relpose_ros.network.features import ViewFeatures
 from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     import numpy.typing as npt
@@ -73,6 +74,17 @@ if TYPE_CHECKING:
 
 class ScanError(RelPoseError):
     """A scan that nothing can be said about."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What the network sees in one view."""
+
+    features: ViewFeatures
+    crop_parameters: torch.Tensor
+    """(3,)."""
+    places: DescriptorMap | None
+    """What it says of single places, where its preset has descriptors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +170,7 @@ class Estimator:
         self._evidence = evidence
         self._matcher = self._matcher_of(evidence)
         self._grid = GridEmbeddings(network)
-        self._looks: WeakKeyDictionary[View, tuple[ViewFeatures, torch.Tensor]] = WeakKeyDictionary()
+        self._looks: WeakKeyDictionary[View, _Look] = WeakKeyDictionary()
         self._lock = threading.Lock()
 
     @classmethod
@@ -272,6 +284,13 @@ class Estimator:
         with self._lock:
             return self._features(scan)
 
+    def places(self, view: View) -> DescriptorMap | None:
+        """What the network says of a view's places beside SIFT; None where its preset has no descriptors."""
+        with self._lock:
+            if view not in self._looks:
+                self._look(view)
+            return self._looks[view].places
+
     @torch.no_grad()
     def rotations(self, features: SceneFeatures) -> FloatArray:
         """The jointly best rotations, camera_from_object, the first the identity. -> (N, 3, 3).
@@ -337,7 +356,9 @@ class Estimator:
         """Everything that is known of the pairs before their rotations are brought together."""
         features = self._features(scan)
         calibration = self._calibration or Calibration()
-        geometries = {} if self._matcher is None else self._matcher.geometries(scan.views)
+        geometries = {}
+        if self._matcher is not None:
+            geometries = self._matcher.geometries(scan.views, self._places(scan.views))
         spoken = [peaks(each) for each in geometries.values()]
         # The temperature belongs to the network's energies, not to what is added to them.
         temperature = calibration.temperature if self._evidence.learned else math.inf
@@ -417,13 +438,21 @@ class Estimator:
             for view in new:
                 self._look(view)
         looks = [self._looks[view] for view in scan.views]
-        stacked = torch.stack([crop_parameters for _, crop_parameters in looks])
-        return self._network.relate(ViewFeatures.stack([look for look, _ in looks]), stacked)
+        stacked = torch.stack([look.crop_parameters for look in looks])
+        return self._network.relate(ViewFeatures.stack([look.features for look in looks]), stacked)
 
     @torch.no_grad()  # of the caller's it would not hear in a thread of its own
     def _look(self, view: View) -> None:
         image, crop_parameters = crop_view(view, self.preset)
-        self._looks[view] = (self._network.look(image[None])[0], crop_parameters)
+        features, places = self._network.look(image[None])[0], None
+        if features.maps is not None:
+            places = DescriptorMap(features.maps.numpy(), *crop_square(view.box))
+        self._looks[view] = _Look(features, crop_parameters, places)
+
+    def _places(self, views: Sequence[View]) -> dict[View, DescriptorMap]:
+        """What the network says of the places of views that it has looked at, if it is to speak."""
+        known = {view: self._looks[view].places for view in views} if self._evidence.learned else {}
+        return {view: places for view, places in known.items() if places is not None}
 
     def _matcher_of(self, evidence: EvidenceSettings) -> Matcher | None:
         alone = self._regresses or evidence.use == "network"

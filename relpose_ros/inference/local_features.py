@@ -4,11 +4,15 @@ A surface seen at a slant is squeezed. So that it matches, features are found in
 one direction and by one factor of all that ASIFT (Morel and Yu 2009) tries, since cameras go around an object
 more than over it, and the rest costs more than it adds.
 
+SIFT knows a few pixels around a feature. A network that has learned to tell the places of an object from each
+other speaks beside it, where there is one.
+
 Image coordinates are rays (x / z, y / z) of the pinhole camera.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -42,12 +46,44 @@ CONTRAST = 0.01
 RATIO = 0.85
 """Largest distance of a match relative to the second best in either view (Lowe 2004), on root-normalised
 descriptors."""
+LEARNED_RATIO = 0.93
+"""The same where a network speaks too: what looks alike elsewhere on the object is further away then."""
+LEARNED_SHARE = 0.3
+"""Of the network's descriptors in the likeness of two features; the rest is SIFT's. Of 373 pairs of views
+within 110 degrees (two photographed captures, ten rendered ones, all unseen) 196 had a pose right to 10
+degrees with it and 170 without; with 0.2 and 0.4 it were 191 and 189."""
 ROUNDING = 1e-5
 """Of a squared distance of descriptors."""
 SQUEEZE = 2.0
 """Factor by which the width of the picture is divided: surfaces turned by 60 degrees."""
 SAME_PLACE = 2.0
 """Pixels within which a feature of the squeezed picture is one of the picture as it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class DescriptorMap:
+    """What a network says of the places of a view, and where in the view they are."""
+
+    descriptors: Descriptors
+    """(C, h, w), unit length, at the middles of equal parts of the crop."""
+    left: int
+    top: int
+    """Of the crop, pixels of the full image."""
+    side: int
+    """Of the crop, pixels."""
+
+    def at(self, pixels: FloatArray) -> Descriptors:
+        """Unit descriptors of pixels (K, 2) of the full image, zero outside the crop. -> (K, C)."""
+        import torch
+
+        places = torch.from_numpy(2 * (pixels - [self.left, self.top]) / self.side - 1).float()
+        sampled = torch.nn.functional.grid_sample(
+            *(torch.from_numpy(self.descriptors)[None], places[None, None]),
+            padding_mode="border",
+            align_corners=False,
+        )[0, :, 0].T
+        inside = (places.abs() <= 1).all(1, keepdim=True)
+        return np.asarray((torch.nn.functional.normalize(sampled) * inside).numpy())
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +95,8 @@ class LocalFeatures:
     orientations: FloatArray
     """(K,) rad, of the gradients that a feature's descriptor is relative to."""
     descriptors: Descriptors
-    """(K, 128), unit length, root-normalised (Arandjelovic and Zisserman 2012)."""
+    """(K, 128), unit length, root-normalised (Arandjelovic and Zisserman 2012); (K, 128 + C) with a network's
+    behind them."""
     places: IntArray
     """(K,) position of the first feature at the same place: mostly a feature's own."""
     plain: int
@@ -71,6 +108,8 @@ class LocalFeatures:
     strays: bool = False
     """Whether features of what stands around the object may be among them, although they should not: a box
     has room for them, and no mask tells them apart."""
+    learned: bool = False
+    """Whether a network's descriptors are among ``descriptors``."""
     outline: Outline | None = None
     """As `relpose_ros.inference.outlines.find_outline` has it."""
 
@@ -85,11 +124,14 @@ def extent(rays: FloatArray) -> float:
     return float(np.sqrt(max(np.linalg.eigvalsh(np.cov(rays.T))[0], 0.0)))
 
 
-def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
+def find_features(
+    view: View, learned: DescriptorMap | None = None, *, surroundings: bool = False
+) -> LocalFeatures:
     """SIFT features of the object, or of all the picture.
 
     Args:
         view: Its intrinsics are guessed from the size of the image where it has none.
+        learned: What a network says of its places.
         surroundings: Whether what lies outside the object's box and mask takes part. A static table helps a
             moving camera, and misleads where the object is what turns.
     """
@@ -113,6 +155,8 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
     # Sizes are whole: the sides may have been scaled a little differently.
     pixels = points * [picture.shape[1] / grey.shape[1], picture.shape[0] / grey.shape[0]]
     pixels += [left + view.origin[0], top + view.origin[1]]
+    if learned is not None:
+        descriptors = _joined(descriptors, learned.at(pixels))
     rays = rays_of(view, pixels)
     known = known_rays(rays)
     plain = int(known[: len(found[0][0])].sum())
@@ -122,6 +166,7 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
         *(rays[known], orientations[known], descriptors[known], places, plain, pixel),
         guessed=view.intrinsics is None,
         strays=view.mask is None and not surroundings,
+        learned=learned is not None,
         outline=find_outline(view),
     )
 
@@ -129,25 +174,36 @@ def find_features(view: View, *, surroundings: bool = False) -> LocalFeatures:
 def match(first: LocalFeatures, second: LocalFeatures) -> IntArray:
     """Features that are each other's nearest, and much nearer than either's second.
 
-    Of two squeezed pictures none says more than of the pictures as they are.
+    Of two squeezed pictures none says more than of the pictures as they are. Where a network speaks, it must
+    of both views.
 
     Returns:
         (M, 2) positions; no two of the same places.
     """
+    ratio = LEARNED_RATIO if first.learned else RATIO
     plain_i, squeezed_i = np.split(first.descriptors, [first.plain])
     plain_j, squeezed_j = np.split(second.descriptors, [second.plain])
     found = np.concatenate(
         [
-            _nearest(plain_i, plain_j),
-            _nearest(squeezed_i, plain_j) + np.array([first.plain, 0]),
-            _nearest(plain_i, squeezed_j) + np.array([0, second.plain]),
+            _nearest(plain_i, plain_j, ratio),
+            _nearest(squeezed_i, plain_j, ratio) + np.array([first.plain, 0]),
+            _nearest(plain_i, squeezed_j, ratio) + np.array([0, second.plain]),
         ]
     )
     places = np.stack([first.places[found[:, 0]], second.places[found[:, 1]]], 1)
     return found[np.sort(np.unique(places, axis=0, return_index=True)[1])]
 
 
-def _nearest(first: Descriptors, second: Descriptors) -> IntArray:
+def _joined(descriptors: Descriptors, learned: Descriptors) -> Descriptors:
+    """SIFT's descriptors (K, 128) with the network's (K, C) behind them, unit length. -> (K, 128 + C).
+
+    Of places that the network did not see SIFT speaks alone.
+    """
+    share = LEARNED_SHARE * (learned**2).sum(1, keepdims=True)
+    return np.concatenate([np.sqrt(1 - share) * descriptors, math.sqrt(LEARNED_SHARE) * learned], 1)
+
+
+def _nearest(first: Descriptors, second: Descriptors, ratio: float) -> IntArray:
     """Descriptors that are each other's nearest, by Lowe's ratio test from both sides. -> (M, 2)."""
     if len(first) < 2 or len(second) < 2:
         return np.zeros((0, 2), np.int64)
@@ -156,18 +212,18 @@ def _nearest(first: Descriptors, second: Descriptors) -> IntArray:
     rows = np.arange(len(likeness))
     highest = likeness[rows, best]
     likeness[rows, best] = -1
-    chosen = rows[_apart(highest, likeness.max(1))]
+    chosen = rows[_apart(highest, likeness.max(1), ratio)]
     # The other way round for the few that are left alone, and worked out anew: columns are slow to read.
     columns = second[best[chosen]] @ first.T
     mutual = columns.argmax(1) == chosen
     columns[np.arange(len(chosen)), chosen] = -1
-    chosen = chosen[mutual & _apart(highest[chosen], columns.max(1))]
+    chosen = chosen[mutual & _apart(highest[chosen], columns.max(1), ratio)]
     return np.stack([chosen, best[chosen]], 1)
 
 
-def _apart(best: Descriptors, second: Descriptors) -> npt.NDArray[np.bool_]:
+def _apart(best: Descriptors, second: Descriptors, ratio: float) -> npt.NDArray[np.bool_]:
     """Lowe's ratio test, by inner products of unit descriptors: of two that look the same, none is nearer."""
-    return np.asarray(2 - 2 * best + ROUNDING < RATIO**2 * (2 - 2 * second))
+    return np.asarray(2 - 2 * best + ROUNDING < ratio**2 * (2 - 2 * second))
 
 
 def _detect(grey: Any, region: Any, most: int) -> tuple[FloatArray, FloatArray, Descriptors]:

@@ -22,11 +22,11 @@ from relpose_ros.inference.two_view_poses import explain
 from relpose_ros.inference.uncertainty import BASIN
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     import numpy.typing as npt
 
-    from relpose_ros.inference.local_features import LocalFeatures
+    from relpose_ros.inference.local_features import DescriptorMap, LocalFeatures
     from relpose_ros.inference.two_view_poses import RelativePose, Support
     from relpose_ros.views import View
 
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 TRUST = (-7.98, 2.31, -3.15, 2.54)
 """Coefficients of `trust`: the bias, and those of `Support.signs`."""
+LEARNED_TRUST = (-9.57, 2.33, -4.08, 1.21)
+"""The same where a network's descriptors helped to match."""
 LARGEST_TRUST = 0.995
 """No captures are enough to learn how rare the rarest mistakes are."""
 WIDENING = 8.0
@@ -83,17 +85,17 @@ def relate(first: LocalFeatures, second: LocalFeatures) -> TwoViewGeometry:
     if found is None:
         return NOTHING
     places = np.stack([first.places[found.inliers[:, 0]], second.places[found.inliers[:, 1]]], 1)
-    return TwoViewGeometry(found.poses, places, trust(found.support))
+    return TwoViewGeometry(found.poses, places, trust(found.support, learned=first.learned))
 
 
-def trust(support: Support) -> float:
+def trust(support: Support, *, learned: bool = False) -> float:
     """Probability that one of a pair's poses is right, learned from pairs whose pose is known.
 
     Logistic, fitted by `benchmarks/match_trust.py` on the photographs that the shipped network was trained on
     (ascott_hound, buddha, socketed_axe) and on eight rendered captures of held-out objects, by boxes alone:
     photographs know few of the plain and repetitive surfaces that accidental matches come from.
     """
-    bias, *slopes = TRUST
+    bias, *slopes = LEARNED_TRUST if learned else TRUST
     return LARGEST_TRUST / (1 + math.exp(-(bias + float(support.signs @ slopes))))
 
 
@@ -106,19 +108,27 @@ class Matcher:
         self._features: WeakKeyDictionary[View, LocalFeatures] = WeakKeyDictionary()
         self._pairs: WeakKeyDictionary[View, WeakKeyDictionary[View, TwoViewGeometry]] = WeakKeyDictionary()
 
-    def features(self, view: View) -> LocalFeatures:
-        """Of one view."""
+    def features(self, view: View, learned: DescriptorMap | None = None) -> LocalFeatures:
+        """Of one view, with what a network says of it: the first time that it is asked for."""
         if view not in self._features:
-            self._features[view] = find_features(view, surroundings=self._surroundings)
+            self._features[view] = find_features(view, learned, surroundings=self._surroundings)
         return self._features[view]
 
-    def geometries(self, views: Sequence[View]) -> dict[tuple[int, int], TwoViewGeometry]:
-        """Of every pair of views i < j, by their positions; what is new on as many threads as torch has."""
+    def geometries(
+        self, views: Sequence[View], learned: Mapping[View, DescriptorMap] | None = None
+    ) -> dict[tuple[int, int], TwoViewGeometry]:
+        """Of every pair of views i < j, by their positions; what is new on as many threads as torch has.
+
+        Args:
+            views: of one object.
+            learned: what a network says of them, of each or of none.
+        """
         pairs = list(itertools.combinations(range(len(views)), 2))
         known = {(i, j): self._pairs.setdefault(views[i], WeakKeyDictionary()) for i, j in pairs}
         new = [(i, j) for i, j in pairs if views[j] not in known[i, j]]
         unseen = dict.fromkeys(views[view] for pair in new for view in pair)  # each once, in order
-        features = dict(zip(unseen, side_by_side(self.features, unseen), strict=True))
+        looked = side_by_side(lambda view: self.features(view, (learned or {}).get(view)), unseen)
+        features = dict(zip(unseen, looked, strict=True))
         found = side_by_side(lambda pair: relate(*(features[views[view]] for view in pair)), new)
         for (i, j), geometry in zip(new, found, strict=True):
             known[i, j][views[j]] = geometry

@@ -4,13 +4,17 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
 from relpose_ros.captures.folder import Frame, load_capture, save_capture
 from relpose_ros.evaluation.match_trust import RIGHT, MatchedPairs, fit_trust, observe
 from relpose_ros.geometry import so3
+from relpose_ros.inference.estimator import Estimator
 from relpose_ros.inference.local_features import find_features
 from relpose_ros.inference.matches import relate, trust
 from relpose_ros.inference.two_view_poses import explain
+from relpose_ros.network.presets import PRESETS
+from relpose_ros.network.relpose import RelPose
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
 FOCAL, SIDE = 300.0, 160
@@ -72,6 +76,16 @@ def test_observes_the_pairs_whose_cameras_are_known(capture):
     assert pairs.signs[0].tolist() == explained.support.signs.tolist()
     # By the same numbers the matches say how far to trust themselves.
     assert relate(first, second).probability == trust(explained.support)
+
+
+def test_a_networks_descriptors_help_where_there_are_some(capture):
+    torch.manual_seed(0)
+    estimator = Estimator(RelPose(PRESETS["compact"]))
+    with_network = observe(capture, estimator, masked=True)
+    views = [capture.view(k) for k in (0, 1)]
+    explained = explain(*(find_features(view, estimator.places(view)) for view in views))
+    assert with_network.signs[0].tolist() == explained.support.signs.tolist()
+    assert with_network.signs[0].tolist() != observe(capture, masked=True).signs[0].tolist()
 
 
 def test_a_wrong_pose_on_file_counts_as_wrong(capture, textures, tmp_path):

@@ -568,7 +568,7 @@ def test_features_once_a_view_and_matches_once_a_pair(network, ball_on_a_turntab
     looked, related = [], []
     find, relate = matches.find_features, matches.relate
     monkeypatch.setattr(
-        matches, "find_features", lambda view, **options: looked.append(1) or find(view, **options)
+        matches, "find_features", lambda *view, **options: looked.append(1) or find(*view, **options)
     )
     monkeypatch.setattr(matches, "relate", lambda *both: related.append(1) or relate(*both))
     estimator = Estimator(network, CALIBRATED)

@@ -10,6 +10,7 @@ from relpose_ros.inference import local_features
 from relpose_ros.inference.local_features import (
     LARGEST_SCALE,
     LONGEST_SIDE,
+    DescriptorMap,
     LocalFeatures,
     find_features,
     match,
@@ -76,6 +77,52 @@ def test_squeezed_features_match_plain_ones_not_each_other():
     first = replace(features_of(descriptors[:4]), plain=2)
     second = replace(features_of(descriptors[[2, 5, 1, 3]]), plain=2)
     assert match(first, second).tolist() == [[2, 0], [1, 2]]
+
+
+# What a network says beside SIFT.
+
+
+def ramp(left=0, top=0, side=80):
+    """A map whose descriptors turn from (1, 0) at the crop's left to (0, 1) at its right."""
+    angle = np.tile((np.arange(8) + 0.5) / 8 * np.pi / 2, (8, 1)).astype(np.float32)
+    return DescriptorMap(np.stack([np.cos(angle), np.sin(angle)]), left, top, side)
+
+
+def test_descriptors_are_read_where_they_are_in_the_picture():
+    places = np.array([[120.0, 50.0], [145.0, 90.0], [175.0, 70.0], [180.5, 70.0], [140.0, 29.0]])
+    found = ramp(100, 30).at(places)
+    assert found.dtype == np.float32
+    angle = (places[:3, 0] - 100) / 80 * np.pi / 2
+    np.testing.assert_allclose(found[:3], np.stack([np.cos(angle), np.sin(angle)], 1), atol=2e-3)
+    np.testing.assert_array_equal(found[3:], 0, "nothing is known outside the crop")
+    # The map's outermost places are half a place inside the crop; what is beyond them is as they are.
+    np.testing.assert_allclose(ramp().at(np.array([[0.0, 40.0]]))[0], ramp().descriptors[:, 0, 0], atol=1e-6)
+
+
+def test_learned_descriptors_stand_behind_sifts(textured):
+    view = textured(0)
+    plain, joined = find_features(view), find_features(view, ramp(side=160))
+    assert not plain.learned
+    assert joined.learned
+    assert joined.descriptors.shape == (len(plain.descriptors), 130)
+    assert joined.descriptors.dtype == np.float32, "twice the numbers take twice the time"
+    np.testing.assert_array_equal(joined.rays, plain.rays)
+    np.testing.assert_allclose(np.linalg.norm(joined.descriptors, axis=1), 1, atol=1e-5)
+    outside = pixels(plain, view)[:, 0] > 160
+    assert 10 < outside.sum() < len(outside) - 10
+    np.testing.assert_array_equal(joined.descriptors[outside, :128], plain.descriptors[outside])
+    np.testing.assert_array_equal(joined.descriptors[outside, 128:], 0)
+    likeness = joined.descriptors[~outside, :128] @ plain.descriptors[~outside].T
+    np.testing.assert_allclose(likeness.diagonal(), np.sqrt(0.7), atol=1e-4)
+
+
+def test_a_network_tells_apart_what_sift_takes_for_the_same():
+    """Two features that look the same match nothing, until their places are told from each other."""
+    same = np.eye(3, 128, dtype=np.float32)[[0, 0, 1]]
+    assert match(features_of(same), features_of(same)).tolist() == [[2, 2]]
+    places = np.eye(3, 16, dtype=np.float32)
+    told = replace(features_of(local_features._joined(same, places)), learned=True)
+    assert match(told, told).tolist() == [[0, 0], [1, 1], [2, 2]]
 
 
 # Features of a picture.
