@@ -134,8 +134,8 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         metavar="NAME",
         help="relpose (as it ships), relpose-known (its known cameras alone), both (network and matches, not "
-        "refined), learned (the network alone), geometry (the matches alone), constant-translation, identity "
-        "or pycolmap; again for more (default: all)",
+        "refined), learned (the network alone), geometry (SIFT's matches alone), constant-translation, "
+        "identity or pycolmap; again for more (default: all)",
     )
     evaluate.add_argument(
         "--variant",

@@ -38,7 +38,8 @@ METHODS = (
     *("constant-translation", "identity", "pycolmap"),
 )
 """relpose is the estimator as it ships: the network, matches and refinement; relpose-known its cameras that
-it calls known itself. both leaves out the refinement, learned the matches too, geometry the network."""
+it calls known itself. both leaves out the refinement, learned the matches too; geometry has matches of SIFT
+alone, and nothing of the network."""
 DERIVED = {"relpose-known": "relpose", "constant-translation": "learned"}
 """Methods that change the answer of another one."""
 EVIDENCE = {

@@ -16,7 +16,8 @@ class EvidenceSettings:
     surroundings: bool = False
     """Whether features outside the object's box and mask take part."""
     learned: bool = True
-    """Whether the network's rotations take part: False measures what the geometry alone can do."""
+    """Whether the network says anything, of rotations and of places that match: False measures what SIFT's
+    geometry alone can do."""
     first_view_distance: float = 0.0
     """Metres from the first camera to the object frame's origin; 0: not known. A scan whose robot poses tell
     the scale needs none."""

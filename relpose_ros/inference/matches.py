@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 TRUST = (-7.98, 2.31, -3.15, 2.54)
 """Coefficients of `trust`: the bias, and those of `Support.signs`."""
-LEARNED_TRUST = (-9.57, 2.33, -4.08, 1.21)
+LEARNED_TRUST = (-8.96, 2.19, -3.16, 1.1)
 """The same where a network's descriptors helped to match."""
 LARGEST_TRUST = 0.995
 """No captures are enough to learn how rare the rarest mistakes are."""
@@ -94,6 +94,10 @@ def trust(support: Support, *, learned: bool = False) -> float:
     Logistic, fitted by `benchmarks/match_trust.py` on the photographs that the shipped network was trained on
     (ascott_hound, buddha, socketed_axe) and on eight rendered captures of held-out objects, by boxes alone:
     photographs know few of the plain and repetitive surfaces that accidental matches come from.
+
+    Args:
+        support: of the pair's best pose.
+        learned: whether a network's descriptors helped to match.
     """
     bias, *slopes = LEARNED_TRUST if learned else TRUST
     return LARGEST_TRUST / (1 + math.exp(-(bias + float(support.signs @ slopes))))
