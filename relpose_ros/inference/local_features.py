@@ -13,7 +13,7 @@ Image coordinates are rays (x / z, y / z) of the pinhole camera.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +52,8 @@ LEARNED_SHARE = 0.3
 """Of the network's descriptors in the likeness of two features; the rest is SIFT's. Of 373 pairs of views
 within 110 degrees (two photographed captures, ten rendered ones, all unseen) 196 had a pose right to 10
 degrees with it and 170 without; with 0.2 and 0.4 it were 191 and 189."""
+SIFT_NUMBERS = 128
+"""In a descriptor of SIFT's."""
 ROUNDING = 1e-5
 """Of a squared distance of descriptors."""
 SQUEEZE = 2.0
@@ -112,6 +114,13 @@ class LocalFeatures:
     """Whether a network's descriptors are among ``descriptors``."""
     outline: Outline | None = None
     """As `relpose_ros.inference.outlines.find_outline` has it."""
+
+    @cached_property
+    def by_sift(self) -> LocalFeatures:
+        """The same with SIFT's descriptors alone."""
+        of_sift = self.descriptors[:, :SIFT_NUMBERS]
+        lengths = np.linalg.norm(of_sift, axis=1, keepdims=True)
+        return replace(self, descriptors=of_sift / np.maximum(lengths, 1e-9), learned=False)
 
     @cached_property
     def extent(self) -> float:
@@ -235,7 +244,7 @@ def _detect(grey: Any, region: Any, most: int) -> tuple[FloatArray, FloatArray, 
     create: Any = vars(cv2)["SIFT_create"]  # in every version, and in no version's type stubs
     sift = create(nfeatures=round(most / share), contrastThreshold=CONTRAST)
     points, found = sift.detectAndCompute(grey, region)
-    descriptors = np.zeros((0, 128), np.float32) if found is None else found
+    descriptors = np.zeros((0, SIFT_NUMBERS), np.float32) if found is None else found
     strongest = np.argsort([-point.response for point in points], kind="stable")[:most]
     points, descriptors = [points[k] for k in strongest], descriptors[strongest]
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))

@@ -85,21 +85,17 @@ def relate(first: LocalFeatures, second: LocalFeatures) -> TwoViewGeometry:
     if found is None:
         return NOTHING
     places = np.stack([first.places[found.inliers[:, 0]], second.places[found.inliers[:, 1]]], 1)
-    return TwoViewGeometry(found.poses, places, trust(found.support, learned=first.learned))
+    return TwoViewGeometry(found.poses, places, trust(found.support))
 
 
-def trust(support: Support, *, learned: bool = False) -> float:
+def trust(support: Support) -> float:
     """Probability that one of a pair's poses is right, learned from pairs whose pose is known.
 
     Logistic, fitted by `benchmarks/match_trust.py` on the photographs that the shipped network was trained on
     (ascott_hound, buddha, socketed_axe) and on eight rendered captures of held-out objects, by boxes alone:
     photographs know few of the plain and repetitive surfaces that accidental matches come from.
-
-    Args:
-        support: of the pair's best pose.
-        learned: whether a network's descriptors helped to match.
     """
-    bias, *slopes = LEARNED_TRUST if learned else TRUST
+    bias, *slopes = LEARNED_TRUST if support.learned else TRUST
     return LARGEST_TRUST / (1 + math.exp(-(bias + float(support.signs @ slopes))))
 
 

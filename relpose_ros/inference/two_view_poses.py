@@ -33,6 +33,9 @@ THRESHOLD = 1.5
 """Of an inlier, in pixels of the picture in which the features were found."""
 REACH = 4.0
 """Pixels: matches that may obey a rival of the pose that was found, if not that one."""
+WALL = 8
+"""Matches that stay where they are, from which on something is taken to stand still around the object. Of 700
+pairs of photographs and renderings without such a thing none had more than five."""
 SHAKE = 64.0
 """By which a camera that is meant to stand still may shift the picture that features are found in, pixels."""
 SHAKEN_SHARE = 0.8
@@ -94,6 +97,8 @@ class Support:
     """Their mean distance from epipolar lines, pixels: accidental ones lie anywhere up to `THRESHOLD`."""
     spread: float
     """Of the inliers across their longest extent, relative to all features, in the view where it is less."""
+    learned: bool = False
+    """Whether a network's descriptors helped to match."""
 
     @property
     def signs(self) -> FloatArray:
@@ -115,7 +120,8 @@ class Explanation:
 def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
     """The poses that explain the matches of two views.
 
-    None where there are too few matches, or too few that any pose explains.
+    None where there are too few matches, or too few that any pose explains. Where something may stand still
+    around the object SIFT is asked alone: a network that was taught objects takes one brick for the next.
     """
     matches = match(first, second)
     if not (first.strays and second.strays):
@@ -124,7 +130,10 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
     # gripper before a camera in the hand. What stays where it was tells little in any other case.
     pixel = math.sqrt(first.pixel * second.pixel)
     shifts = np.linalg.norm(second.rays[matches[:, 1]] - first.rays[matches[:, 0]], axis=1) / pixel
-    matches, shifts = matches[shifts > THRESHOLD], shifts[shifts > THRESHOLD]
+    moves = shifts > THRESHOLD
+    if first.learned and np.count_nonzero(~moves) >= WALL:
+        return explain(first.by_sift, second.by_sift)
+    matches, shifts = matches[moves], shifts[moves]
     found = _explained(first, second, matches)
     if found is None:
         return None
@@ -133,10 +142,13 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
     directions = directions_of(first, second, matches)
     turn = commonest_turn(directions, reach)
     stays = follows(turn, directions, reach)
-    if stays.sum() < LEAST_MATCHES or np.median(shifts[stays]) > SHAKE:
+    if stays.sum() < LEAST_MATCHES:
         return found
     share = follows(turn, directions_of(first, second, found.inliers), reach).mean()
-    if share < SUSPECT_SHARE:
+    if first.learned:
+        turned = so3.angle_between(found.poses[0].rotation, turn) > SEPARATION
+        return found if turned and share < SUSPECT_SHARE else explain(first.by_sift, second.by_sift)
+    if share < SUSPECT_SHARE or np.median(shifts[stays]) > SHAKE:
         return found
     rest = _explained(first, second, matches[~stays])
     if share > SHAKEN_SHARE:
@@ -183,7 +195,8 @@ def _explained(first: LocalFeatures, second: LocalFeatures, matches: IntArray) -
         for view, features in enumerate((first, second))
     )
     return Explanation(
-        stated, inliers, Support(len(inliers), float(distances[inside].mean()) / pixel, spread)
+        *(stated, inliers),
+        Support(len(inliers), float(distances[inside].mean()) / pixel, spread, first.learned),
     )
 
 

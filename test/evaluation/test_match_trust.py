@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,7 +79,12 @@ def test_observes_the_pairs_whose_cameras_are_known(capture):
     assert relate(first, second).probability == trust(explained.support)
 
 
-def test_a_networks_descriptors_help_where_there_are_some(capture):
+def test_a_networks_descriptors_help_where_there_are_some(textures, tmp_path):
+    """With masks: nothing stands still around the object, and SIFT is not asked alone."""
+    frames = [photograph(textures, turn) for turn in TURNS]
+    whole = np.ones((SIDE, SIDE), bool)
+    frames = [Frame(replace(view, mask=whole), pose) for view, pose in frames]
+    capture = save_capture(tmp_path / "masked", frames)
     torch.manual_seed(0)
     estimator = Estimator(RelPose(PRESETS["compact"]))
     with_network = observe(capture, estimator, masked=True)

@@ -114,6 +114,8 @@ def test_learned_descriptors_stand_behind_sifts(textured):
     np.testing.assert_array_equal(joined.descriptors[outside, 128:], 0)
     likeness = joined.descriptors[~outside, :128] @ plain.descriptors[~outside].T
     np.testing.assert_allclose(likeness.diagonal(), np.sqrt(0.7), atol=1e-4)
+    assert not joined.by_sift.learned
+    np.testing.assert_allclose(joined.by_sift.descriptors, plain.descriptors, atol=1e-6)
 
 
 def test_a_network_tells_apart_what_sift_takes_for_the_same():

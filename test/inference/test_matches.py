@@ -14,10 +14,11 @@ from relpose_ros.captures.folder import load_capture
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import homogeneous
 from relpose_ros.inference import matches, two_view_poses
-from relpose_ros.inference.local_features import LocalFeatures, find_features
+from relpose_ros.inference.local_features import DescriptorMap, LocalFeatures, find_features
 from relpose_ros.inference.matches import NOTHING, Matcher, TwoViewGeometry, peaks, relate, trust
 from relpose_ros.inference.outlines import Outline
 from relpose_ros.inference.two_view_poses import LEAST_MATCHES, RelativePose, Support, explain
+from relpose_ros.network.crops import crop_square
 from relpose_ros.views import BoundingBox
 
 
@@ -202,6 +203,16 @@ def test_a_static_background_takes_no_part(ball_on_a_turntable, rotation_of_ball
     assert degrees(misled.poses[0].rotation, np.eye(3)) < 3
 
 
+def unspoken(_view):
+    """No network."""
+
+
+def undecided(view):
+    """A network that takes all places for the same."""
+    left, top, side = crop_square(view.box)
+    return DescriptorMap(np.full((4, 2, 2), 0.5, np.float32), left, top, side)
+
+
 def shaken(view, turn_deg):
     """As a camera sees it that turns in its place."""
     lens = view.intrinsics
@@ -213,17 +224,19 @@ def shaken(view, turn_deg):
     return replace(view, image=image)
 
 
+@pytest.mark.parametrize("network", [unspoken, undecided])
 @pytest.mark.parametrize("bounded", [True, False])
 @pytest.mark.parametrize("turn_deg", [(0.2, 0.2, 0), (0.5, 0.5, 0), (2, 0, 0), (0, 0, 1), (0.5, 0.5, 2)])
 def test_a_background_before_a_camera_that_turns_in_its_place_says_nothing_either(
-    ball_on_a_turntable, rotation_of_ball, turn_deg, bounded
+    ball_on_a_turntable, rotation_of_ball, turn_deg, bounded, network
 ):
     """It was meant to stand still. In a whole picture wall and object may suit one pose, that of the wall."""
     views = [ball_on_a_turntable(turn, masked=False) for turn in (0, 20, 180)]
     if not bounded:
         whole = BoundingBox(0, 0, views[0].full_width, views[0].full_height)
         views = [replace(view, box=whole) for view in views]
-    first, same, other = map(find_features, [views[0], *(shaken(view, turn_deg) for view in views[1:])])
+    views = [views[0], *(shaken(view, turn_deg) for view in views[1:])]
+    first, same, other = (find_features(view, network(view)) for view in views)
     found = relate(first, same)
     truth = so3.exp(np.radians(turn_deg)) @ rotation_of_ball(20) @ rotation_of_ball(0).T
     assert found.probability > 0.5
@@ -240,16 +253,38 @@ def test_a_camera_that_moves_a_little_around_an_object_is_no_shaking_one(point_s
     assert degrees(found.poses[0].rotation, scene.relative(0, 1)[0]) < 1
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_where_something_stands_still_sift_is_asked_alone(ball_on_a_turntable, masked):
+    """A network was taught objects, and takes one brick of a wall for the next."""
+    views = [ball_on_a_turntable(turn, masked=masked) for turn in (0, 20)]
+    found = explain(*(find_features(view, undecided(view)) for view in views))
+    assert found.support.learned is masked
+    assert relate(*(find_features(view, undecided(view)) for view in views)).probability == trust(
+        found.support
+    )
+
+
+@pytest.mark.parametrize(("angle", "learned"), [(3, False), (40, True)])
+def test_of_cameras_that_hardly_moved_sift_says_enough(point_scene, angle, learned):
+    """They may as well have turned in their places before a wall."""
+    scene = point_scene.ring([0, angle], points=200)
+    found = explain(*(replace(each, strays=True, learned=True) for each in scene.features()))
+    assert found.support.learned is learned
+    assert len(found.inliers) > 150
+    assert degrees(found.poses[0].rotation, scene.relative(0, 1)[0]) < 1
+
+
+@pytest.mark.parametrize("network", [unspoken, undecided])
 @pytest.mark.parametrize(("bounded", "least", "most"), [(True, 0.5, 4), (False, 0.9, 3)])
 def test_without_a_mask_what_stays_in_place_says_nothing(
-    ball_on_a_turntable, rotation_of_ball, bounded, least, most
+    ball_on_a_turntable, rotation_of_ball, bounded, least, most, network
 ):
     """A box has corners that do not turn; without a region of interest most of the picture does not."""
     views = [ball_on_a_turntable(turn, masked=False) for turn in (0, 20, 180)]
     if not bounded:
         whole = BoundingBox(0, 0, views[0].full_width, views[0].full_height)
         views = [replace(view, box=whole) for view in views]
-    features = [find_features(view) for view in views]
+    features = [find_features(view, network(view)) for view in views]
     found = relate(features[0], features[1])
     truth = rotation_of_ball(20) @ rotation_of_ball(0).T
     assert found.probability > least
