@@ -1,6 +1,6 @@
 """How far matches are to be trusted: the constants of `relpose_ros.inference.matches`, fitted on captures.
 
-    python -m benchmarks.match_trust CAPTURE... [--boxes] [--sift-alone]
+    python -m benchmarks.match_trust CAPTURE... [--boxes] [--sift-alone] [--weights FILE]
 
 Matches all pairs of each capture's photographs whose pose is known, with their masks where there are some.
 """
@@ -36,12 +36,13 @@ def main() -> None:
     )
     parser.add_argument("captures", type=Path, nargs="*", help="capture folders with poses")
     parser.add_argument("--boxes", action="store_true", help="leave masks aside")
-    parser.add_argument("--sift-alone", action="store_true", help="without the shipped network's descriptors")
+    parser.add_argument("--sift-alone", action="store_true", help="without a network's descriptors")
+    parser.add_argument("--weights", type=Path, help="whose descriptors help (default: those that ship)")
     arguments = parser.parse_args()
     if not arguments.captures:
         print("Nothing to fit: name captures with poses.")
         return
-    estimator = None if arguments.sift_alone else Estimator.from_weights()
+    estimator = None if arguments.sift_alone else Estimator.from_weights(arguments.weights)
     parts = [
         observe(load_capture(each), estimator, masked=not arguments.boxes)
         for each in tqdm(arguments.captures)

@@ -55,7 +55,9 @@ def observe(capture: Capture, estimator: Estimator | None = None, *, masked: boo
     """
     photos = [k for k, photo in enumerate(capture.photos) if photo.camera_from_world is not None]
     views = [capture.view(k, masked=masked) for k in photos]
-    features = [find_features(view, None if estimator is None else estimator.places(view)) for view in views]
+    features = [
+        find_features(view, None if estimator is None else estimator.descriptor_map(view)) for view in views
+    ]
     rotations = [np.asarray(capture.photos[k].camera_from_world)[:, :3] for k in photos]
     signs, right, errors, covariances = [], [], [], []
     for i in range(len(photos)):

@@ -83,7 +83,7 @@ class _Look:
     features: ViewFeatures
     crop_parameters: torch.Tensor
     """(3,)."""
-    places: DescriptorMap | None
+    descriptor_map: DescriptorMap | None
     """What it says of single places, where its preset has descriptors."""
 
 
@@ -103,8 +103,8 @@ class _Found:
     def tempered_energies(self) -> PairEnergies:
         """The energies as they add up over a scan.
 
-        Every view takes part in N - 1 pairs, whose errors in the network's eyes go together: beside matches,
-        which err each for themselves, their sum counts N / 2 times too much.
+        Every view takes part in N - 1 pairs, whose errors in the network's eyes go together. Those of matches
+        hardly do: beside them the sum of the network's energies counts N / 2 times too much.
         """
         if self.energies.evidence is None:
             return self.energies
@@ -284,12 +284,10 @@ class Estimator:
         with self._lock:
             return self._features(scan)
 
-    def places(self, view: View) -> DescriptorMap | None:
-        """What the network says of a view's places beside SIFT; None where its preset has no descriptors."""
+    def descriptor_map(self, view: View) -> DescriptorMap | None:
+        """What the network says of the places of a view; None where its preset has no descriptors."""
         with self._lock:
-            if view not in self._looks:
-                self._look(view)
-            return self._looks[view].places
+            return self._looked_at([view])[0].descriptor_map
 
     @torch.no_grad()
     def rotations(self, features: SceneFeatures) -> FloatArray:
@@ -358,7 +356,7 @@ class Estimator:
         calibration = self._calibration or Calibration()
         geometries = {}
         if self._matcher is not None:
-            geometries = self._matcher.geometries(scan.views, self._places(scan.views))
+            geometries = self._matcher.geometries(scan.views, self._descriptor_maps(scan.views))
         spoken = [peaks(each) for each in geometries.values()]
         # The temperature belongs to the network's energies, not to what is added to them.
         temperature = calibration.temperature if self._evidence.learned else math.inf
@@ -429,30 +427,39 @@ class Estimator:
         return None if after < before - LARGEST_LOSS * found.energies.count else refined
 
     def _features(self, scan: Scan) -> SceneFeatures:
+        looks = self._looked_at(scan.views)
+        stacked = torch.stack([look.crop_parameters for look in looks])
+        return self._network.relate(ViewFeatures.stack([look.features for look in looks]), stacked)
+
+    def _looked_at(self, views: Sequence[View]) -> list[_Look]:
         # Each view by itself: a batch of another size may round differently, and a scan's answer must not
         # depend on how many of its views arrived together.
-        new = [view for view in dict.fromkeys(scan.views) if view not in self._looks]
+        new = [view for view in dict.fromkeys(views) if view not in self._looks]
         if self.preset.small_convolutions:
             side_by_side(self._look, new)
         else:
             for view in new:
                 self._look(view)
-        looks = [self._looks[view] for view in scan.views]
-        stacked = torch.stack([look.crop_parameters for look in looks])
-        return self._network.relate(ViewFeatures.stack([look.features for look in looks]), stacked)
+        return [self._looks[view] for view in views]
 
     @torch.no_grad()  # of the caller's it would not hear in a thread of its own
     def _look(self, view: View) -> None:
         image, crop_parameters = crop_view(view, self.preset)
-        features, places = self._network.look(image[None])[0], None
+        features, descriptor_map = self._network.look(image[None])[0], None
         if features.maps is not None:
-            places = DescriptorMap(features.maps.numpy(), *crop_square(view.box))
-        self._looks[view] = _Look(features, crop_parameters, places)
+            descriptor_map = DescriptorMap(features.maps.numpy(), *crop_square(view.box))
+        self._looks[view] = _Look(features, crop_parameters, descriptor_map)
 
-    def _places(self, views: Sequence[View]) -> dict[View, DescriptorMap]:
-        """What the network says of the places of views that it has looked at, if it is to speak."""
-        known = {view: self._looks[view].places for view in views} if self._evidence.learned else {}
-        return {view: places for view, places in known.items() if places is not None}
+    def _descriptor_maps(self, views: Sequence[View]) -> dict[View, DescriptorMap]:
+        """What stands beside SIFT's descriptors.
+
+        Of weights that nobody calibrated nobody knows how well they tell places apart, and of what is around
+        the object no network was taught anything.
+        """
+        if self._calibration is None or self._evidence.surroundings or not self._evidence.learned:
+            return {}
+        maps = {view: look.descriptor_map for view, look in zip(views, self._looked_at(views), strict=True)}
+        return {view: known for view, known in maps.items() if known is not None}
 
     def _matcher_of(self, evidence: EvidenceSettings) -> Matcher | None:
         alone = self._regresses or evidence.use == "network"

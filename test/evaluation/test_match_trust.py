@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from relpose_ros.captures.folder import Frame, load_capture, save_capture
 from relpose_ros.evaluation.match_trust import RIGHT, MatchedPairs, fit_trust, observe
@@ -14,8 +13,7 @@ from relpose_ros.inference.estimator import Estimator
 from relpose_ros.inference.local_features import find_features
 from relpose_ros.inference.matches import relate, trust
 from relpose_ros.inference.two_view_poses import explain
-from relpose_ros.network.presets import PRESETS
-from relpose_ros.network.relpose import RelPose
+from relpose_ros.network.checkpoint import random_network
 from relpose_ros.views import BoundingBox, Intrinsics, View
 
 FOCAL, SIDE = 300.0, 160
@@ -85,11 +83,10 @@ def test_a_networks_descriptors_help_where_there_are_some(textures, tmp_path):
     whole = np.ones((SIDE, SIDE), bool)
     frames = [Frame(replace(view, mask=whole), pose) for view, pose in frames]
     capture = save_capture(tmp_path / "masked", frames)
-    torch.manual_seed(0)
-    estimator = Estimator(RelPose(PRESETS["compact"]))
+    estimator = Estimator(random_network("compact", 0))
     with_network = observe(capture, estimator, masked=True)
     views = [capture.view(k) for k in (0, 1)]
-    explained = explain(*(find_features(view, estimator.places(view)) for view in views))
+    explained = explain(*(find_features(view, estimator.descriptor_map(view)) for view in views))
     assert with_network.signs[0].tolist() == explained.support.signs.tolist()
     assert with_network.signs[0].tolist() != observe(capture, masked=True).signs[0].tolist()
 

@@ -20,6 +20,7 @@ from relpose_ros.inference.estimator import OWN_THREADS, Estimator, EvidenceSett
 from relpose_ros.inference.outlines import find_outline, sighted_translations
 from relpose_ros.inference.predictions import about_the_object, predicted_translations, regressed_poses
 from relpose_ros.network.checkpoint import random_network, write_network
+from relpose_ros.network.crops import crop_square
 from relpose_ros.network.features import SceneFeatures
 from relpose_ros.network.presets import PRESETS, named_preset
 from relpose_ros.views import BoundingBox, Intrinsics, RobotPose, Scan, View
@@ -562,6 +563,54 @@ def test_same_bits_with_evidence_whatever_was_estimated_before(network, ball, ba
     grown.estimate(Scan("ball", ball.views[1:]))
     again = Scan("ball", tuple(ball_on_a_turntable(turn) for turn in TURNS))
     assert numbers(grown.estimate(ball)) == numbers(Estimator(network, CALIBRATED).estimate(again))
+
+
+@pytest.mark.parametrize(
+    ("calibration", "evidence", "learned"),
+    [
+        (CALIBRATED, EvidenceSettings(), True),
+        (CALIBRATED, EvidenceSettings(surroundings=True), False),
+        (CALIBRATED, EvidenceSettings(learned=False), False),
+        (None, EvidenceSettings(), False),
+    ],
+)
+def test_the_networks_descriptors_help_to_match_where_they_are_known_to(
+    network, ball, calibration, evidence, learned
+):
+    estimator = Estimator(network, calibration, evidence)
+    estimator.estimate(ball)
+    assert [estimator._matcher.features(view).learned for view in ball.views] == [learned] * 3
+
+
+def test_a_descriptor_map_lies_where_its_crop_does(network, textured):
+    """The same of a part of the picture that holds the crop."""
+    box = BoundingBox(60, 50, 120, 100)
+    left, top, side = crop_square(box)
+    assert (left, top) != (0, 0)
+    full = textured(0, box=box)
+    part = replace(full, image=full.image[10:140, 30:180], origin=(30, 10))
+    maps = [Estimator(network).descriptor_map(view) for view in (full, part)]
+    for each in maps:
+        assert (each.left, each.top, each.side) == (left, top, side)
+        assert each.descriptors.shape == (64, 16, 16)
+    np.testing.assert_array_equal(maps[0].descriptors, maps[1].descriptors)
+
+
+def test_a_network_without_descriptors_has_no_map(textured):
+    regresses = random_network(named_preset("compact", ["regression"]), 0)
+    assert Estimator(regresses).descriptor_map(textured(0)) is None
+
+
+def test_same_bits_when_a_view_was_looked_at_alone(network, ball):
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)  # one view by itself would have both
+    try:
+        alone, together = Estimator(network, CALIBRATED), Estimator(network, CALIBRATED)
+        for view in ball.views:
+            alone.descriptor_map(view)
+        assert numbers(alone.estimate(ball)) == numbers(together.estimate(ball))
+    finally:
+        torch.set_num_threads(threads)
 
 
 def test_features_once_a_view_and_matches_once_a_pair(network, ball_on_a_turntable, monkeypatch):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import cv2
@@ -125,6 +126,22 @@ def test_a_network_tells_apart_what_sift_takes_for_the_same():
     places = np.eye(3, 16, dtype=np.float32)
     told = replace(features_of(local_features._joined(same, places)), learned=True)
     assert match(told, told).tolist() == [[0, 0], [1, 1], [2, 2]]
+
+
+@pytest.mark.parametrize(("ratio", "by_sift", "with_network"), [(0.80, 1, 1), (0.89, 0, 1), (0.96, 0, 0)])
+def test_a_network_allows_a_nearer_rival(ratio, by_sift, with_network):
+    """Of one feature and two that are nearly as far from it, by the ratio of the distances."""
+    near = 0.5
+    descriptors = np.zeros((3, 128), np.float32)
+    descriptors[0, 0] = 1
+    for row, distance in ((1, near), (2, near / ratio)):
+        likeness = 1 - distance**2 / 2
+        descriptors[row, [0, row]] = likeness, math.sqrt(1 - likeness**2)
+    far = np.eye(1, 128, 9, dtype=np.float32)
+    first, second = features_of(np.concatenate([descriptors[:1], far])), features_of(descriptors[1:])
+    assert [0, 0] in match(first, second).tolist() or not by_sift
+    assert len(match(first, second)) == by_sift
+    assert len(match(replace(first, learned=True), replace(second, learned=True))) == with_network
 
 
 # Features of a picture.

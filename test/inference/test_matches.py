@@ -313,6 +313,12 @@ def test_trust_grows_with_what_speaks_for_a_pose():
     assert 0 <= trust(support(residual=0.0, spread=0.0)) < 1
 
 
+def test_matches_that_a_network_helped_to_are_trusted_by_numbers_of_their_own():
+    """More of them are accidental."""
+    for inliers in (20, 40, 80):
+        assert trust(replace(support(inliers), learned=True)) < trust(support(inliers)) - 0.03
+
+
 def test_accidental_matches_support_a_pose_less(point_scene):
     """Points seen twice, and pictures that have none in common: those obey some pose, but not as nearly."""
     right = explain(*point_scene.ring([0, 25], points=40).features(noise=0.3))
