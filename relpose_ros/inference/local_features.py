@@ -184,12 +184,16 @@ def find_features(
 def match(first: LocalFeatures, second: LocalFeatures) -> IntArray:
     """Features that are each other's nearest, and much nearer than either's second.
 
-    Of two squeezed pictures none says more than of the pictures as they are. Where a network speaks, it must
-    of both views.
+    Of two squeezed pictures none says more than of the pictures as they are.
 
     Returns:
         (M, 2) positions; no two of the same places.
+
+    Raises:
+        ValueError: A network's descriptors are among those of one view alone.
     """
+    if first.learned != second.learned:
+        raise ValueError("A network has described one of the two views alone: they cannot be compared.")
     ratio = LEARNED_RATIO if first.learned else RATIO
     plain_i, squeezed_i = np.split(first.descriptors, [first.plain])
     plain_j, squeezed_j = np.split(second.descriptors, [second.plain])

@@ -128,6 +128,12 @@ def test_a_network_tells_apart_what_sift_takes_for_the_same():
     assert match(told, told).tolist() == [[0, 0], [1, 1], [2, 2]]
 
 
+def test_views_that_a_network_described_match_only_each_other():
+    plain = features_of(np.eye(4, 128, dtype=np.float32))
+    with pytest.raises(ValueError, match="one of the two views alone"):
+        match(plain, replace(plain, learned=True))
+
+
 @pytest.mark.parametrize(("ratio", "by_sift", "with_network"), [(0.80, 1, 1), (0.89, 0, 1), (0.96, 0, 0)])
 def test_a_network_allows_a_nearer_rival(ratio, by_sift, with_network):
     """Of one feature and two that are nearly as far from it, by the ratio of the distances."""
