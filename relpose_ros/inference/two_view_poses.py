@@ -34,7 +34,7 @@ THRESHOLD = 1.5
 REACH = 4.0
 """Pixels: matches that may obey a rival of the pose that was found, if not that one."""
 WALL = 8
-"""Matches that stay where they are, from which on something is taken to stand still around the object. Of 700
+"""Matches that stay where they are, from which on something is taken to stand still around the object. Of 1100
 pairs of photographs and renderings without such a thing none had more than five."""
 SHAKE = 64.0
 """By which a camera that is meant to stand still may shift the picture that features are found in, pixels."""
@@ -146,6 +146,7 @@ def explain(first: LocalFeatures, second: LocalFeatures) -> Explanation | None:
         return found
     share = follows(turn, directions_of(first, second, found.inliers), reach).mean()
     if first.learned:
+        # A pose that has no more than that turn's rotation is a wall's, or of a camera that hardly moved.
         turned = so3.angle_between(found.poses[0].rotation, turn) > SEPARATION
         return found if turned and share < SUSPECT_SHARE else explain(first.by_sift, second.by_sift)
     if share < SUSPECT_SHARE or np.median(shifts[stays]) > SHAKE:
