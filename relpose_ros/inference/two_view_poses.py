@@ -34,8 +34,8 @@ THRESHOLD = 1.5
 REACH = 4.0
 """Pixels: matches that may obey a rival of the pose that was found, if not that one."""
 WALL = 8
-"""Matches that stay where they are, from which on something is taken to stand still around the object. Of 1100
-pairs of photographs and renderings without such a thing none had more than five."""
+"""Matches that stay where they are, from which on something is taken to stand still around the object. Of
+1100 pairs of photographs and renderings without such a thing none had more than five."""
 SHAKE = 64.0
 """By which a camera that is meant to stand still may shift the picture that features are found in, pixels."""
 SHAKEN_SHARE = 0.8
