@@ -51,8 +51,8 @@ LEARNED_RATIO = 0.93
 LEARNED_SHARE = 0.3
 """Of the network's descriptors in the likeness of two features; the rest is SIFT's. Chosen on 373 pairs of
 views within 110 degrees (two photographed captures, ten rendered ones, none trained on): 196 had a pose right
-to 10 degrees with it and 170 without; with 0.2 and 0.4 it were 191 and 189. That is the shipped network;
-others that learned the same should be like it."""
+to 10 degrees with it, 170 without, 191 with 0.2 and 189 with 0.4. That is the shipped network; others that
+learned the same should be like it."""
 SIFT_NUMBERS = 128
 """In a descriptor of SIFT's."""
 ROUNDING = 1e-5
