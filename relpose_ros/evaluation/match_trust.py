@@ -48,6 +48,8 @@ class MatchedPairs:
 def observe(capture: Capture, estimator: Estimator | None = None, *, masked: bool) -> MatchedPairs:
     """Match every pair of a capture's posed photos.
 
+    Beside a network those pairs are left out that `explain` asked SIFT alone about: their trust is SIFT's.
+
     Args:
         capture: folder of photos.
         estimator: whose network speaks beside SIFT; None for SIFT alone.
@@ -63,7 +65,7 @@ def observe(capture: Capture, estimator: Estimator | None = None, *, masked: boo
     for i in range(len(photos)):
         for j in range(i + 1, len(photos)):
             explained = explain(features[i], features[j])
-            if explained is None:
+            if explained is None or explained.support.learned is not features[i].learned:
                 continue
             truth = rotations[j] @ rotations[i].T
             turns = [so3.log(truth @ pose.rotation.T) for pose in explained.poses]

@@ -126,16 +126,17 @@ class Matcher:
         pairs = list(itertools.combinations(range(len(views)), 2))
         known = {(i, j): self._pairs.setdefault(views[i], WeakKeyDictionary()) for i, j in pairs}
         new = [(i, j) for i, j in pairs if views[j] not in known[i, j]]
-        unseen = dict.fromkeys(views[view] for pair in new for view in pair)  # each once, in order
-        side_by_side(lambda view: self._find(view, (learned or {}).get(view)), unseen)
+        asked = dict.fromkeys(views[view] for pair in new for view in pair)  # each once, in order
+        unseen = [view for view in asked if view not in self._features]
+        maps = learned or {}
+        looked = side_by_side(
+            lambda view: find_features(view, maps.get(view), surroundings=self._surroundings), unseen
+        )
+        self._features.update(zip(unseen, looked, strict=True))
         found = side_by_side(lambda pair: relate(*(self._features[views[view]] for view in pair)), new)
         for (i, j), geometry in zip(new, found, strict=True):
             known[i, j][views[j]] = geometry
         return {(i, j): known[i, j][views[j]] for i, j in pairs}
-
-    def _find(self, view: View, learned: DescriptorMap | None) -> None:
-        if view not in self._features:
-            self._features[view] = find_features(view, learned, surroundings=self._surroundings)
 
 
 def peaks(geometry: TwoViewGeometry) -> list[Peak]:

@@ -91,6 +91,15 @@ def test_a_networks_descriptors_help_where_there_are_some(textures, tmp_path):
     assert with_network.signs[0].tolist() != observe(capture, masked=True).signs[0].tolist()
 
 
+def test_what_sift_alone_was_asked_about_is_not_fitted_as_the_networks(capture):
+    """Cameras that hardly turned, without masks: something may stand still around the object."""
+    estimator = Estimator(random_network("compact", 0))
+    views = [capture.view(k) for k in (0, 1)]
+    explained = explain(*(find_features(view, estimator.descriptor_map(view)) for view in views))
+    assert not explained.support.learned
+    assert explained.support.signs.tolist() not in observe(capture, estimator, masked=True).signs.tolist()
+
+
 def test_a_wrong_pose_on_file_counts_as_wrong(capture, textures, tmp_path):
     frames = [Frame(*photograph(textures, turn)) for turn in TURNS[:2]]
     turned = so3.exp([0, 0, 0.5]) @ frames[1].camera_from_world
