@@ -13,6 +13,7 @@ Image coordinates are rays (x / z, y / z) of the pinhole camera.
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -159,7 +160,11 @@ def find_features(
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
         region = None if region is None else cv2.resize(region, size, interpolation=cv2.INTER_NEAREST)
     narrow, narrow_region = _squeezed(grey, region)
-    found = [_detect(grey, region, MOST_FEATURES), _detect(narrow, narrow_region, MOST_SQUEEZED)]
+    # Every pair of one view more waits for both.
+    with ThreadPoolExecutor(min(2, cv2.getNumThreads())) as pool:
+        found = list(
+            pool.map(_detect, (grey, narrow), (region, narrow_region), (MOST_FEATURES, MOST_SQUEEZED))
+        )
     found[1][0][:, 0] *= grey.shape[1] / narrow.shape[1]
     points, orientations, descriptors = (np.concatenate(parts) for parts in zip(*found, strict=True))
     # Sizes are whole: the sides may have been scaled a little differently.

@@ -364,3 +364,17 @@ def test_a_box_with_hardly_a_pixel_has_no_features_of_elsewhere(textured, box):
 def test_an_empty_mask_has_no_features(textured):
     view = textured(0, mask=np.zeros((160, 200), bool))
     assert len(find_features(view).rays) == 0
+
+
+def test_the_same_features_on_any_number_of_threads(textured):
+    view, threads = textured(0), cv2.getNumThreads()
+    try:
+        found = []
+        for count in (1, 2):
+            cv2.setNumThreads(count)
+            found.append(find_features(view))
+    finally:
+        cv2.setNumThreads(threads)
+    assert len(found[0].rays) > 200
+    for name in ("rays", "orientations", "descriptors", "places"):
+        assert getattr(found[0], name).tobytes() == getattr(found[1], name).tobytes()
