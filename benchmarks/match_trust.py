@@ -1,8 +1,9 @@
 """How far matches are to be trusted: the constants of `relpose_ros.inference.matches`, fitted on captures.
 
-    python -m benchmarks.match_trust CAPTURE... [--boxes] [--sift-alone] [--weights FILE]
+    python -m benchmarks.match_trust CAPTURE... [--boxes] [--descriptors [--weights FILE]]
 
 Matches all pairs of each capture's photographs whose pose is known, with their masks where there are some.
+With a network's descriptors it prints what `relpose_ros calibrate` keeps with its weights, of these captures.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from relpose_ros.captures.folder import load_capture
-from relpose_ros.evaluation.match_trust import MatchedPairs, fit_trust, observe
+from relpose_ros.evaluation.match_trust import MatchedPairs, fit_trust, observe_capture
 from relpose_ros.inference.estimator import Estimator
 
 FACTORS = (1.0, 2.0, 4.0, 8.0, 16.0)
@@ -36,25 +37,25 @@ def main() -> None:
     )
     parser.add_argument("captures", type=Path, nargs="*", help="capture folders with poses")
     parser.add_argument("--boxes", action="store_true", help="leave masks aside")
-    parser.add_argument("--sift-alone", action="store_true", help="without a network's descriptors")
-    parser.add_argument("--weights", type=Path, help="whose descriptors help (default: those that ship)")
+    parser.add_argument("--descriptors", action="store_true", help="a network's descriptors help")
+    parser.add_argument("--weights", type=Path, help="whose (default: those that ship)")
     arguments = parser.parse_args()
     if not arguments.captures:
         print("Nothing to fit: name captures with poses.")
         return
-    estimator = None if arguments.sift_alone else Estimator.from_weights(arguments.weights)
-    parts = [
-        observe(load_capture(each), estimator, masked=not arguments.boxes)
-        for each in tqdm(arguments.captures)
-    ]
-    pairs = MatchedPairs(
-        *(np.concatenate(column) for column in zip(*(vars(p).values() for p in parts), strict=True))
+    estimator = Estimator.from_weights(arguments.weights) if arguments.descriptors else None
+    pairs = MatchedPairs.joined(
+        [
+            observe_capture(load_capture(each), estimator, masked=not arguments.boxes)
+            for each in tqdm(arguments.captures)
+        ]
     )
+    found = fit_trust(pairs)
+    if found is None:
+        print(f"Too few pairs to fit: {len(pairs.right)} matched, {pairs.right.sum()} of them right.")
+        return
     print(f"{len(pairs.right)} matched pairs, {pairs.right.mean():.0%} right")
-    print(
-        "TRUST =" if arguments.sift_alone else "LEARNED_TRUST =",
-        tuple(float(value) for value in fit_trust(pairs).round(2)),
-    )
+    print("match_trust =" if arguments.descriptors else "TRUST =", tuple(np.round(found, 2).tolist()))
     print("log likelihood of the errors, by factor (down) and floor in degrees (across)")
     print(" " * 6 + "".join(f"{floor:8.1f}" for floor in FLOORS_DEG))
     for factor in FACTORS:

@@ -472,9 +472,9 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
-    from relpose_ros.evaluation.calibrate import SCANS, calibrate, calibration_table
+    from relpose_ros.evaluation.calibrate import SCANS, calibrate, calibration_table, trust_line
 
-    calibration, reports = calibrate(
+    found = calibrate(
         {str(path): list(_posed_views(path, arguments)) for path in arguments.capture},
         arguments.weights,
         arguments.output,
@@ -482,8 +482,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         half=arguments.half,
     )
-    print(f"{calibration.to_json()}\n\nOn other scans, uncalibrated -> calibrated:\n")
-    print(calibration_table(reports))
+    print(f"{found.calibration.to_json()}\n\nOn other scans, uncalibrated -> calibrated:\n")
+    print(f"{calibration_table(found.reports)}\n\n{trust_line(found.trust)}")
     return 0
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from itertools import count, cycle, islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from relpose_ros.evaluation import match_trust
+from relpose_ros.evaluation.match_trust import MatchedPairs, fit_trust, measure_trust
 from relpose_ros.evaluation.protocol import EvaluationError, view_orders
 from relpose_ros.inference.calibration import (
     LEVELS,
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from relpose_ros.evaluation.match_trust import TrustReport
     from relpose_ros.evaluation.protocol import PosedViews
     from relpose_ros.inference.calibration import CalibrationReport, Observation
     from relpose_ros.network.relpose import RelPose
@@ -49,6 +53,16 @@ Reports = dict[str, tuple["CalibrationReport", "CalibrationReport"]]
 """By group: uncalibrated and calibrated."""
 
 
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibration, and what it is worth on other scans than it was fitted on."""
+
+    calibration: Calibration
+    reports: Reports
+    trust: TrustReport | None
+    """Of matches that the network's descriptors help to; None where it has none, or too few matched."""
+
+
 def calibrate(
     groups: Mapping[str, Sequence[PosedViews]],
     weights: Path,
@@ -58,8 +72,10 @@ def calibrate(
     seed: int = 0,
     half: bool = False,
     progress: bool = True,
-) -> tuple[Calibration, Reports]:
+) -> Calibrated:
     """Fits a calibration, measures it on other scans of the same captures, and stores it with the weights.
+
+    That of a network with local descriptors says, too, how far to trust the matches that they help to.
 
     Args:
         groups: Captures by a name. All groups count the same; the captures of one take turns, drawn at random
@@ -88,8 +104,8 @@ def calibrate(
     if network.preset.rotation == "regression":
         text = f"{weights} regresses poses and states no probabilities; there is nothing to calibrate."
         raise EvaluationError(text)
-    fitted_on: list[Observation] = []
-    others: dict[str, list[Observation]] = {}
+    fitted_on: list[_Observed] = []
+    others: dict[str, list[_Observed]] = {}
     with tqdm(total=2 * scans * len(groups), unit="scan", disable=not progress) as bar:
         observed = _observer(network, bar.update)
         for name, captures in groups.items():
@@ -97,14 +113,20 @@ def calibrate(
             drawn = _scans(captures, seed)
             fitted_on += [observed(*scan) for scan in islice(drawn, scans)]
             others[name] = [observed(*scan) for scan in islice(drawn, scans)]
-    calibration = fit_calibration(fitted_on, LEAST_FLAT, LEAST_SIGMA)
+    calibration = fit_calibration([each.scan for each in fitted_on], LEAST_FLAT, LEAST_SIGMA)
+    trust = fit_trust(MatchedPairs.joined([each.matched for each in fitted_on]))
+    calibration = replace(calibration, match_trust=trust)
     metadata = {**read_metadata(weights), "calibration": calibration.to_json()}
     write_network(network, output, metadata, half=half)
-    reports = {
-        name: (measure_calibration(group, Calibration()), measure_calibration(group, calibration))
-        for name, group in others.items()
-    }
-    return calibration, reports
+    reports = {}
+    for name, group in others.items():
+        scans_of = [each.scan for each in group]
+        reports[name] = (
+            measure_calibration(scans_of, Calibration()),
+            measure_calibration(scans_of, calibration),
+        )
+    matched = MatchedPairs.joined([each.matched for group in others.values() for each in group])
+    return Calibrated(calibration, reports, None if trust is None else measure_trust(matched, trust))
 
 
 def _scans(captures: Sequence[PosedViews], seed: int) -> Iterator[tuple[PosedViews, list[int]]]:
@@ -119,21 +141,44 @@ def _scans(captures: Sequence[PosedViews], seed: int) -> Iterator[tuple[PosedVie
             yield capture, order
 
 
+@dataclass(frozen=True, eq=False)
+class _Observed:
+    """A scan by the network, and its pairs by the matches that its descriptors help to."""
+
+    scan: Observation
+    matched: MatchedPairs
+
+
 def _observer(
     network: RelPose, on_scan: Callable[[], object]
-) -> Callable[[PosedViews, list[int]], Observation]:
+) -> Callable[[PosedViews, list[int]], _Observed]:
     estimator, grid = Estimator(network), GridEmbeddings(network)
 
-    def observed(capture: PosedViews, order: list[int]) -> Observation:
+    def observed(capture: PosedViews, order: list[int]) -> _Observed:
         views = tuple(capture.view(k) for k in order)
         features = estimator.features(Scan(capture.name, views))
         poses = capture.camera_from_world[order]
         translations = predicted_translations(network, features, poses[:, :, :3] @ poses[0, :, :3].T)
-        on_scan()
         outlines = [find_outline(view) for view in views]
-        return observe(network, grid, features, translations, outlines, poses[:, :, :3], poses[:, :, 3])
+        scan = observe(network, grid, features, translations, outlines, poses[:, :, :3], poses[:, :, 3])
+        has_descriptors = network.preset.correlation is not None
+        matched = match_trust.observe(views if has_descriptors else (), poses[:, :, :3], estimator)
+        on_scan()
+        return _Observed(scan, matched)
 
     return observed
+
+
+def trust_line(trust: TrustReport | None) -> str:
+    """How far matches are trusted that the network's descriptors help to, as a sentence for a terminal."""
+    if trust is None:
+        return (
+            "SIFT will match alone: no descriptors, or too few matched pairs to learn how far to trust them."
+        )
+    return (
+        f"Its descriptors help to match: of {trust.pairs} pairs {trust.right:.0%} were right, "
+        f"{trust.stated:.0%} was stated, calibration error {trust.expected_calibration_error:.3f}."
+    )
 
 
 def calibration_table(reports: Reports) -> str:

@@ -67,6 +67,9 @@ class Calibration:
     flat: float = 0.0
     """Share of the uniform distribution that is mixed in: how often the network is plainly wrong of a pair,
     as on photographs unlike its training images. Without it such a pair outvotes all else that is known."""
+    match_trust: tuple[float, ...] | None = None
+    """Coefficients of `matches.trust` where this network's descriptors helped to match. None: nobody fitted
+    any, and SIFT matches alone."""
 
     def to_json(self) -> str:
         """As kept in the weights' metadata, under ``calibration``."""
@@ -77,8 +80,9 @@ class Calibration:
         """Reads what `to_json` wrote; other keys (a report kept beside it) are passed over."""
         stored = json.loads(text)
         known = {field.name: stored[field.name] for field in fields(cls) if field.name in stored}
-        if "position_sigma" in known:
-            known["position_sigma"] = tuple(float(sigma) for sigma in known["position_sigma"])
+        for several in ("position_sigma", "match_trust"):
+            if known.get(several) is not None:
+                known[several] = tuple(float(number) for number in known[several])
         return cls(**known)
 
 

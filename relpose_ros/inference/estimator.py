@@ -167,6 +167,7 @@ class Estimator:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._regresses = network.preset.rotation == "regression"
         self._calibration = None if self._regresses else calibration
+        self._match_trust = None if self._calibration is None else self._calibration.match_trust
         self._evidence = evidence
         self._matcher = self._matcher_of(evidence)
         self._grid = GridEmbeddings(network)
@@ -453,17 +454,19 @@ class Estimator:
     def _descriptor_maps(self, views: Sequence[View]) -> dict[View, DescriptorMap]:
         """What stands beside SIFT's descriptors.
 
-        Of weights that nobody calibrated nobody knows how well they tell places apart, and of what is around
-        the object no network was taught anything.
+        Of weights whose calibration does not say so nobody knows how well they tell places apart, and of what
+        is around the object no network was taught anything.
         """
-        if self._calibration is None or self._evidence.surroundings or not self._evidence.learned:
+        if self._match_trust is None or self._evidence.surroundings or not self._evidence.learned:
             return {}
         maps = {view: look.descriptor_map for view, look in zip(views, self._looked_at(views), strict=True)}
         return {view: known for view, known in maps.items() if known is not None}
 
     def _matcher_of(self, evidence: EvidenceSettings) -> Matcher | None:
         alone = self._regresses or evidence.use == "network"
-        return None if alone else Matcher(surroundings=evidence.surroundings)
+        if alone:
+            return None
+        return Matcher(surroundings=evidence.surroundings, learned_trust=self._match_trust)
 
 
 def _outlines(scan: Scan) -> list[Outline | None]:

@@ -34,9 +34,10 @@ if TYPE_CHECKING:
     IntArray = npt.NDArray[np.int64]
 
 TRUST = (-7.98, 2.31, -3.15, 2.54)
-"""Coefficients of `trust`: the bias, and those of `Support.signs`."""
-LEARNED_TRUST = (-8.96, 2.19, -3.16, 1.1)
-"""The same where a network's descriptors helped to match."""
+"""Coefficients of `trust` for SIFT's matches: the bias, and those of `Support.signs`. Fitted by
+`benchmarks/match_trust.py` on the photographs that the shipped network was trained on (ascott_hound, buddha,
+socketed_axe) and on eight rendered captures of held-out objects, by boxes alone: photographs know few of the
+plain and repetitive surfaces that accidental matches come from."""
 LARGEST_TRUST = 0.995
 """No captures are enough to learn how rare the rarest mistakes are."""
 WIDENING = 8.0
@@ -79,34 +80,47 @@ class TwoViewGeometry:
 NOTHING = TwoViewGeometry((), np.zeros((0, 2), np.int64), 0.0)
 
 
-def relate(first: LocalFeatures, second: LocalFeatures) -> TwoViewGeometry:
-    """The relative pose of two views by their matches, and how far it is to be trusted."""
+def relate(
+    first: LocalFeatures, second: LocalFeatures, *, learned_trust: Sequence[float] | None = None
+) -> TwoViewGeometry:
+    """The relative pose of two views by their matches, and how far it is to be trusted.
+
+    Args:
+        first: features of view i.
+        second: features of view j.
+        learned_trust: coefficients of `trust` where a network's descriptors helped to match.
+
+    Raises:
+        ValueError: they helped, and there are none.
+    """
     found = explain(first, second)
     if found is None:
         return NOTHING
+    coefficients = learned_trust if found.support.learned else TRUST
+    if coefficients is None:
+        raise ValueError("A network's descriptors helped to match; how far to trust that must be given.")
     places = np.stack([first.places[found.inliers[:, 0]], second.places[found.inliers[:, 1]]], 1)
-    return TwoViewGeometry(found.poses, places, trust(found.support))
+    return TwoViewGeometry(found.poses, places, trust(found.support, coefficients))
 
 
-def trust(support: Support) -> float:
+def trust(support: Support, coefficients: Sequence[float] = TRUST) -> float:
     """Probability that one of a pair's poses is right, learned from pairs whose pose is known.
 
-    Logistic, fitted by `benchmarks/match_trust.py` on the photographs that the shipped network was trained on
-    (ascott_hound, buddha, socketed_axe) and on eight rendered captures of held-out objects, by boxes alone:
-    photographs know few of the plain and repetitive surfaces that accidental matches come from. The network's
-    descriptors know these photographs; of 30 inliers 0.4 pixels off over half of the object it makes 0.57,
-    and fitted on two captures that they do not know instead (maryrose_tankard, saharov32) 0.50.
+    Args:
+        support: what speaks for the poses.
+        coefficients: (4,) of the logistic regression; those of a network's descriptors are kept with its
+            weights, as `Calibration.match_trust`.
     """
-    bias, *slopes = LEARNED_TRUST if support.learned else TRUST
+    bias, *slopes = coefficients
     return LARGEST_TRUST / (1 + math.exp(-(bias + float(support.signs @ slopes))))
 
 
 class Matcher:
     """Finds the features of a view and the geometry of a pair once, for as long as the views are held."""
 
-    def __init__(self, *, surroundings: bool = False) -> None:
-        """Takes what `find_features` takes."""
-        self._surroundings = surroundings
+    def __init__(self, *, surroundings: bool = False, learned_trust: Sequence[float] | None = None) -> None:
+        """Takes what `find_features` and `relate` take."""
+        self._surroundings, self._learned_trust = surroundings, learned_trust
         self._features: WeakKeyDictionary[View, LocalFeatures] = WeakKeyDictionary()
         self._pairs: WeakKeyDictionary[View, WeakKeyDictionary[View, TwoViewGeometry]] = WeakKeyDictionary()
 
@@ -121,19 +135,21 @@ class Matcher:
 
         Args:
             views: of one object.
-            learned: what a network says of them, of each or of none.
+            learned: what a network says of them, of each or of none; not without ``learned_trust``.
         """
         pairs = list(itertools.combinations(range(len(views)), 2))
         known = {(i, j): self._pairs.setdefault(views[i], WeakKeyDictionary()) for i, j in pairs}
         new = [(i, j) for i, j in pairs if views[j] not in known[i, j]]
         asked = dict.fromkeys(views[view] for pair in new for view in pair)  # each once, in order
         unseen = [view for view in asked if view not in self._features]
-        maps = learned or {}
+        maps, trusted = learned or {}, self._learned_trust
         looked = side_by_side(
             lambda view: find_features(view, maps.get(view), surroundings=self._surroundings), unseen
         )
         self._features.update(zip(unseen, looked, strict=True))
-        found = side_by_side(lambda pair: relate(*(self._features[views[view]] for view in pair)), new)
+        found = side_by_side(
+            lambda pair: relate(*(self._features[views[view]] for view in pair), learned_trust=trusted), new
+        )
         for (i, j), geometry in zip(new, found, strict=True):
             known[i, j][views[j]] = geometry
         return {(i, j): known[i, j][views[j]] for i, j in pairs}

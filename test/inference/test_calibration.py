@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -109,8 +110,10 @@ def test_cameras_are_placed_by_whichever_is_nearer_to_the_truth(fisher_scene_typ
 
 
 def test_kept_with_the_weights_as_text():
-    calibration = Calibration(2.5, 1.1, 0.9, True, (0.1, 0.3))
+    calibration = Calibration(2.5, 1.1, 0.9, True, (0.1, 0.3), match_trust=(-9.0, 2.0, -3.0, 1.0))
     assert Calibration.from_json(calibration.to_json()) == calibration
+    alone = replace(calibration, match_trust=None)
+    assert Calibration.from_json(alone.to_json()) == alone
     assert Calibration.from_json('{"temperature": 2.0, "report": {"pairs": 3}}') == Calibration(
         temperature=2.0
     )

@@ -333,7 +333,7 @@ def test_regressed_poses_in_metres(regressing):
 # What the pictures themselves say: a ball on a turntable before a background that stays.
 
 TURNS = (0, 20, 40)
-CALIBRATED = Calibration(temperature=3.0, flat=0.1)
+CALIBRATED = Calibration(temperature=3.0, flat=0.1, match_trust=(-9.0, 2.2, -3.2, 1.1))
 
 
 @pytest.fixture(scope="module")
@@ -571,6 +571,7 @@ def test_same_bits_with_evidence_whatever_was_estimated_before(network, ball, ba
         (CALIBRATED, EvidenceSettings(), True),
         (CALIBRATED, EvidenceSettings(surroundings=True), False),
         (CALIBRATED, EvidenceSettings(learned=False), False),
+        (replace(CALIBRATED, match_trust=None), EvidenceSettings(), False),
         (None, EvidenceSettings(), False),
     ],
 )
@@ -619,7 +620,9 @@ def test_features_once_a_view_and_matches_once_a_pair(network, ball_on_a_turntab
     monkeypatch.setattr(
         matches, "find_features", lambda *view, **options: looked.append(1) or find(*view, **options)
     )
-    monkeypatch.setattr(matches, "relate", lambda *both: related.append(1) or relate(*both))
+    monkeypatch.setattr(
+        matches, "relate", lambda *both, **options: related.append(1) or relate(*both, **options)
+    )
     estimator = Estimator(network, CALIBRATED)
     views = tuple(ball_on_a_turntable(turn) for turn in TURNS)
     estimator.estimate(Scan("ball", views[:2]))

@@ -14,10 +14,12 @@ from relpose_ros.captures.folder import load_capture
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import homogeneous
 from relpose_ros.inference import matches, two_view_poses
+from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.local_features import DescriptorMap, LocalFeatures, find_features
 from relpose_ros.inference.matches import NOTHING, Matcher, TwoViewGeometry, peaks, relate, trust
 from relpose_ros.inference.outlines import Outline
 from relpose_ros.inference.two_view_poses import LEAST_MATCHES, RelativePose, Support, explain
+from relpose_ros.network.checkpoint import read_metadata
 from relpose_ros.network.crops import crop_square
 from relpose_ros.views import BoundingBox
 
@@ -207,6 +209,9 @@ def unspoken(_view):
     """No network."""
 
 
+SHIPPED_TRUST = Calibration.from_json(read_metadata(None)["calibration"]).match_trust
+
+
 def undecided(view):
     """A network that takes all places for the same."""
     left, top, side = crop_square(view.box)
@@ -237,11 +242,13 @@ def test_a_background_before_a_camera_that_turns_in_its_place_says_nothing_eithe
         views = [replace(view, box=whole) for view in views]
     views = [views[0], *(shaken(view, turn_deg) for view in views[1:])]
     first, same, other = (find_features(view, network(view)) for view in views)
-    found = relate(first, same)
+    found = relate(first, same, learned_trust=SHIPPED_TRUST)
     truth = so3.exp(np.radians(turn_deg)) @ rotation_of_ball(20) @ rotation_of_ball(0).T
     assert found.probability > 0.5
     assert degrees(found.poses[0].rotation, truth) < 5
-    assert relate(first, other).probability == 0, "the other side: nothing else is in both"
+    assert relate(first, other, learned_trust=SHIPPED_TRUST).probability == 0, (
+        "the other side: nothing else is in both"
+    )
 
 
 def test_a_camera_that_moves_a_little_around_an_object_is_no_shaking_one(point_scene):
@@ -257,11 +264,16 @@ def test_a_camera_that_moves_a_little_around_an_object_is_no_shaking_one(point_s
 def test_where_something_stands_still_sift_is_asked_alone(ball_on_a_turntable, masked):
     """A network was taught objects, and takes one brick of a wall for the next."""
     views = [ball_on_a_turntable(turn, masked=masked) for turn in (0, 20)]
-    found = explain(*(find_features(view, undecided(view)) for view in views))
-    assert found.support.learned is masked
-    assert relate(*(find_features(view, undecided(view)) for view in views)).probability == trust(
-        found.support
-    )
+    features = [find_features(view, undecided(view)) for view in views]
+    support = explain(*features).support
+    assert support.learned is masked
+    numbers = {"coefficients": SHIPPED_TRUST} if masked else {}
+    assert relate(*features, learned_trust=SHIPPED_TRUST).probability == trust(support, **numbers)
+    if masked:
+        with pytest.raises(ValueError, match="how far to trust that must be given"):
+            relate(*features)
+    else:
+        assert relate(*features).probability == trust(support)
 
 
 @pytest.mark.parametrize(("angle", "learned"), [(3, False), (40, True)])
@@ -285,11 +297,13 @@ def test_without_a_mask_what_stays_in_place_says_nothing(
         whole = BoundingBox(0, 0, views[0].full_width, views[0].full_height)
         views = [replace(view, box=whole) for view in views]
     features = [find_features(view, network(view)) for view in views]
-    found = relate(features[0], features[1])
+    found = relate(features[0], features[1], learned_trust=SHIPPED_TRUST)
     truth = rotation_of_ball(20) @ rotation_of_ball(0).T
     assert found.probability > least
     assert degrees(found.poses[0].rotation, truth) < most
-    assert relate(features[0], features[2]).probability == 0, "the other side: nothing else is in both"
+    assert relate(features[0], features[2], learned_trust=SHIPPED_TRUST).probability == 0, (
+        "the other side: nothing else is in both"
+    )
     assert relate(features[0], features[0]).probability == 0, (
         "of a picture taken twice nobody knows whether anything moved"
     )
@@ -316,7 +330,7 @@ def test_trust_grows_with_what_speaks_for_a_pose():
 def test_matches_that_a_network_helped_to_are_trusted_by_numbers_of_their_own():
     """More of them are accidental."""
     for inliers in (20, 40, 80):
-        assert trust(replace(support(inliers), learned=True)) < trust(support(inliers)) - 0.03
+        assert trust(support(inliers), SHIPPED_TRUST) < trust(support(inliers)) - 0.03
 
 
 def test_accidental_matches_support_a_pose_less(point_scene):
