@@ -25,8 +25,13 @@ HARDLY_ANYTHING = 2
 """Percent within 15 degrees below which a number would claim more than is known; uniform has 0.1."""
 CONTRADICTION_ANGLE = math.radians(10)
 """From this angle on between a pair's own rotation and the final poses' the two disagree."""
-LARGEST_ROTATION_DEVIATION = math.radians(12)
-"""Largest standard deviation (worst axis) of a camera's rotation: within 15 degrees more often than not."""
+CONTRADICTED = 0.1
+"""Probability of the final poses, to 15 degrees, below which a pair that is sure of itself contradicts."""
+MOST_CONTRADICTING = 1 / 6
+"""Such pairs for each one that is trusted. A few are outvoted; of a repetitive surface, which matches take in
+several ways, every third was seen, with poses up to 50 degrees off."""
+LARGEST_ROTATION_DEVIATION = math.radians(7.5)
+"""Largest standard deviation (worst axis) of a camera's rotation: 15 degrees are two of them."""
 SAME_PLACE = math.radians(3)
 """Two views of a trusted pair whose lines of sight differ by less are one: a picture taken twice repeats its
 mistakes."""
@@ -63,13 +68,13 @@ def judge(
 ) -> tuple[Verdict, int, str]:
     """The verdict, the weakest pair's position and the verdict in words.
 
-    ENOUGH asks for five things: a trusted chain of pairs from every camera to the first; that no camera and
+    ENOUGH asks for six things: a trusted chain of pairs from every camera to the first; that no camera and
     no group of them hangs on a single pair, which nothing checks, so that two views are never enough, however
-    often each was taken; a small covariance of every camera's rotation; calibrated probabilities, without
-    which the others mean nothing; and a known focal length where matches are among what it rests on, since
-    with a wrong one all turns are wrong together, by a fifth of them or more. Of positions it asks nothing:
-    their covariances say what is known. Views are named by their position in the scan, from 0, as in the
-    messages.
+    often each was taken; that hardly any pair which is as sure contradicts them; a small covariance of every
+    camera's rotation; calibrated probabilities, without which the others mean nothing; and a known focal
+    length where matches are among what it rests on, since with a wrong one all turns are wrong together, by a
+    fifth of them or more. Of positions it asks nothing: their covariances say what is known. Views are named
+    by their position in the scan, from 0, as in the messages.
 
     Args:
         pairs: of all N views.
@@ -89,6 +94,13 @@ def judge(
         pair = pairs[bridge]
         reason = f"{hangs} on pair {pair.i}-{pair.j} alone, which no other pair checks"
         return Verdict.ONE_MORE_VIEW, bridge, f"{ONE_MORE}{reason}"
+    against = [p for p, pair in enumerate(pairs) if _contradicts(pair)]
+    if all(tied) and len(against) > MOST_CONTRADICTING * len(trusted):
+        surest = max(against, key=lambda p: pairs[p].probability_within_15_deg)
+        reason = (
+            f"{len(trusted)} of {len(pairs)} pairs agree, but {len(against)} are as sure of something else"
+        )
+        return Verdict.ONE_MORE_VIEW, surest, f"{ONE_MORE}{reason}: {_weakness(pairs[surest])}"
     if all(tied) and deviations.max() <= LARGEST_ROTATION_DEVIATION:
         weakest = min(range(len(pairs)), key=lambda p: _certainty(pairs[p]))
         if guessed and any(Evidence.GEOMETRIC in pairs[p].evidence for p in trusted):
@@ -136,6 +148,12 @@ def without_room(words: str, keep: str) -> str:
 
 def _certainty(pair: PairRotation) -> float:
     return min(pair.probability_within_15_deg, pair.solution_probability)
+
+
+def _contradicts(pair: PairRotation) -> bool:
+    """Whether a pair would be trusted if it agreed with the final poses."""
+    sure = pair.probability_within_15_deg >= TRUSTED_PROBABILITY
+    return sure and pair.solution_probability < CONTRADICTED
 
 
 def _weakness(pair: PairRotation) -> str:

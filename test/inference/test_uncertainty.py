@@ -373,6 +373,37 @@ def test_contradicting_pairs_are_not_enough(fisher_scene, cameras_around):
     assert "contradicts the others" in words
 
 
+@pytest.mark.parametrize("lies", [[(0, 3)], [(0, 3), (1, 4)]], ids=["one", "two"])
+def test_of_ten_sure_pairs_one_may_be_outvoted_and_two_may_not(fisher_scene, cameras_around, lies):
+    scene = fisher_scene(cameras_around(5, 9), concentration=300.0)
+    for i, j in lies:
+        lie = so3.exp([1.2, 0, 0]) @ scene.relative(i, j)
+        scene.mixtures[i, j] = [(lie, 0.0, 60.0), (np.eye(3), -11.0, 0.0)]  # nearly sure: it can be outvoted
+    pairs, covariances, _ = told(scene)
+    agreeing = [pair.solution_probability > 0.5 for pair in pairs]
+    assert [(pair.i, pair.j) in lies for pair in pairs] == [not agrees for agrees in agreeing]
+    verdict, weakest, words = judge(pairs, covariances, calibrated=True)
+    if len(lies) == 1:
+        assert verdict is Verdict.ENOUGH
+        return
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert (pairs[weakest].i, pairs[weakest].j) in lies
+    assert words.startswith("one more view: 8 of 10 pairs agree, but 2 are as sure of something else: pair ")
+    assert words.endswith("contradicts the others by about 69 degrees")
+
+
+@pytest.mark.parametrize(("deviation_deg", "enough"), [(7.4, True), (7.6, False)])
+def test_enough_means_fifteen_degrees_at_two_standard_deviations(
+    fisher_scene, cameras_around, deviation_deg, enough
+):
+    pairs, covariances, _ = told(fisher_scene(cameras_around(3, 6), concentration=150.0))
+    covariances = covariances.copy()
+    covariances[1, 3:, 3:] = np.diag(np.radians([2.0, deviation_deg, 3.0]) ** 2)
+    verdict, _, words = judge(pairs, covariances, calibrated=True)
+    assert (verdict is Verdict.ENOUGH) is enough
+    assert enough or words.startswith("one more view: rotations are known to about 8 degrees only")
+
+
 def test_flat_pairs_are_not_enough(fisher_scene, cameras_around):
     pairs, covariances, _ = told(fisher_scene(cameras_around(4, 10), concentration=0.2))
     verdict, _, words = judge(pairs, covariances, calibrated=True)
