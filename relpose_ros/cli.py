@@ -148,12 +148,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluate.add_argument(
         "--orders",
-        type=int,
+        type=_at_least(1),
         default=5,
         metavar="K",
         help="random orders of each capture's views (default: 5, the paper's)",
     )
-    evaluate.add_argument("--seed", type=int, default=0, help="seed of those orders (default: 0)")
+    evaluate.add_argument("--seed", type=_at_least(0), default=0, help="seed of those orders (default: 0)")
     evaluate.add_argument("--output", type=Path, metavar="FILE", help="JSON file for the rows")
     _add_weights(evaluate)
 
@@ -179,7 +179,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="K",
         help="scans to fit on, and as many to measure on, of all that a path holds (default: 24)",
     )
-    calibrate.add_argument("--seed", type=int, default=0, help="of the scans (default: 0)")
+    calibrate.add_argument("--seed", type=_at_least(0), default=0, help="of the scans (default: 0)")
     calibrate.add_argument("--half", action="store_true", help="write the weights in float16, half as large")
 
     render = command(
@@ -195,9 +195,15 @@ def _parser() -> argparse.ArgumentParser:
         default="captures",
         help="captures of whole photographs (default), shards of crops for the trainer, or the bags of bags/",
     )
-    render.add_argument("--count", type=int, default=1, metavar="K", help="captures or shards (default: 1)")
-    render.add_argument("--views", type=int, default=10, metavar="N", help="views of each scan (default: 10)")
-    render.add_argument("--seed", type=int, default=0, help="names the endless list of scans (default: 0)")
+    render.add_argument(
+        "--count", type=_at_least(1), default=1, metavar="K", help="captures or shards (default: 1)"
+    )
+    render.add_argument(
+        "--views", type=_at_least(2), default=10, metavar="N", help="views of each scan (default: 10)"
+    )
+    render.add_argument(
+        "--seed", type=_at_least(0), default=0, help="names the endless list of scans (default: 0)"
+    )
     render.add_argument(
         "--assets",
         type=Path,
@@ -208,10 +214,18 @@ def _parser() -> argparse.ArgumentParser:
         "--split", choices=("train", "held_out"), default="train", help="which meshes (default: train)"
     )
     render.add_argument(
-        "--size", type=int, default=128, metavar="PX", help="side of the crops of a shard (default: 128)"
+        "--size",
+        type=_at_least(1),
+        default=128,
+        metavar="PX",
+        help="side of the crops of a shard (default: 128)",
     )
     render.add_argument(
-        "--processes", type=int, default=1, metavar="K", help="processes that render shards (default: 1)"
+        "--processes",
+        type=_at_least(1),
+        default=1,
+        metavar="K",
+        help="processes that render shards (default: 1)",
     )
 
     shard = command(
@@ -229,20 +243,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     shard.add_argument(
         "--copies",
-        type=int,
+        type=_at_least(1),
         default=1,
         metavar="K",
         help="crops of each photo, each with a jitter of its own (default: 1)",
     )
     shard.add_argument(
         "--masked-copies",
-        type=int,
+        type=_at_least(0),
         default=0,
         metavar="K",
         help="how many of them show the object alone, where there are masks (default: 0)",
     )
     _add_split(shard, "train")
-    shard.add_argument("--seed", type=int, default=0, help="of the jitter (default: 0)")
+    shard.add_argument("--seed", type=_at_least(0), default=0, help="of the jitter (default: 0)")
 
     features = command(
         "features",
@@ -253,7 +267,7 @@ def _parser() -> argparse.ArgumentParser:
     features.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to write into")
     features.add_argument(
         "--copies",
-        type=int,
+        type=_at_least(1),
         default=1,
         metavar="K",
         help="how often each scan is looked at, changed at random (default: 1)",
@@ -261,7 +275,7 @@ def _parser() -> argparse.ArgumentParser:
     features.add_argument(
         "--plain", action="store_true", help="look at the scans as they are, for instance to measure on"
     )
-    features.add_argument("--seed", type=int, default=0, help="of the changes (default: 0)")
+    features.add_argument("--seed", type=_at_least(0), default=0, help="of the changes (default: 0)")
 
     train = command(
         "train", _train, "Train a network on rendered shards, or go on with a run that was stopped."
@@ -290,7 +304,10 @@ def _parser() -> argparse.ArgumentParser:
         help="ablation of the paper to train instead; again for several at once",
     )
     train.add_argument(
-        "--images", type=int, metavar="K", help="images to see in the whole run (default: the preset's)"
+        "--images",
+        type=_at_least(1),
+        metavar="K",
+        help="images to see in the whole run (default: the preset's)",
     )
     train.add_argument(
         "--budget", type=float, metavar="SECONDS", help="stop after so long; the same command goes on"
@@ -307,7 +324,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     train.add_argument(
         "--workers",
-        type=int,
+        type=_at_least(0),
         default=0,
         metavar="K",
         help="processes beside it that prepare batches (default: 0)",
@@ -332,7 +349,7 @@ def _parser() -> argparse.ArgumentParser:
         dest="compiled",
         help="compile the step first: minutes, for about half as many images again a second",
     )
-    train.add_argument("--seed", type=int, default=0, help="of the run (default: 0)")
+    train.add_argument("--seed", type=_at_least(0), default=0, help="of the run (default: 0)")
 
     convert = command(
         "convert", _convert, "Turn a released RelPose++ checkpoint into safetensors with its origin inside."
@@ -341,7 +358,7 @@ def _parser() -> argparse.ArgumentParser:
         "source", type=Path, help="checkpoint of the authors' release (.pth), or a safetensors file"
     )
     convert.add_argument(
-        "--output", type=Path, required=True, metavar="FILE", help="safetensors file to write"
+        "--output", type=_home_path, required=True, metavar="FILE", help="safetensors file to write"
     )
     return parser
 
@@ -389,6 +406,18 @@ def _add_topics(parser: argparse.ArgumentParser) -> None:
         help="topic of images or ObjectView in a bag; again for more (default: all ObjectView topics, else "
         "the images of the camera, where there is but one)",
     )
+
+
+def _at_least(least: int) -> Callable[[str], int]:
+    """An argument's type: a whole number, not below another."""
+
+    def number(text: str) -> int:
+        if (value := int(text)) < least:
+            raise argparse.ArgumentTypeError(f"{value} is below {least}, the least")
+        return value
+
+    number.__name__ = "whole number"  # as argparse calls it where the text is none
+    return number
 
 
 def _home_path(text: str) -> Path:
@@ -582,7 +611,7 @@ def _train(arguments: argparse.Namespace) -> int:
     from relpose_ros.training.trainer import Trainer, settings_for
 
     settings = replace(settings_for(arguments.preset, arguments.variant), seed=arguments.seed)
-    if arguments.images:
+    if arguments.images is not None:
         settings = replace(settings, images=arguments.images)
     if arguments.precision:
         settings = replace(settings, precision=arguments.precision)

@@ -74,6 +74,10 @@ SHOWN = {
 """The columns of a table, and their heads: rotation, camera centre, translation."""
 
 
+SAME_PLACE = 1e-9
+"""Of the distance from a world's origin: cameras no further from each other stand at one place."""
+
+
 class EvaluationError(RelPoseError):
     """Nothing can be measured on what was given."""
 
@@ -335,7 +339,8 @@ def evaluate(
         progress: Whether to show a progress bar on stderr.
 
     Raises:
-        EvaluationError: No captures, a number of views outside 2 to 8, a method that there is not (with
+        EvaluationError: No captures, none of as many views or one whose cameras stand at one place, a number
+            of views outside 2 to 8, of orders below 1 or a seed below 0, a method that there is not (with
             these weights), a file that holds no variant or one that was named before, or an output that
             cannot be written.
         NetworkFileError: Weights cannot be loaded.
@@ -348,6 +353,11 @@ def evaluate(
     if not views or min(views) < MIN_VIEWS or max(views) > MAX_VIEWS:
         text = f"numbers of views are {list(views)}; each must lie between {MIN_VIEWS} and {MAX_VIEWS}."
         raise EvaluationError(text)
+    if orders < 1 or seed < 0:
+        raise EvaluationError(
+            f"{orders} orders by the seed {seed} are none; ask for 1 or more, by 0 or more."
+        )
+    _require_measurable(sequences, min(views))
     chosen = _methods(methods, weights, seed, threads) + _variants(variants, threads)
     rows: list[Row] = []
     everywhere: _Scans = {}
@@ -364,6 +374,17 @@ def evaluate(
     rows += [{**row, **_trust(everywhere[row["method"], row["views"]])} for row in mean_rows(rows)]
     _write(rows, output)
     return rows
+
+
+def _require_measurable(sequences: Sequence[PosedViews], least: int) -> None:
+    most = max(len(sequence.camera_from_world) for sequence in sequences)
+    if most < least:
+        raise EvaluationError(f"no capture has {least} views with a pose, the most have {most}.")
+    for each in sequences:
+        centres = camera_centre(each.camera_from_world[:, :, :3], each.camera_from_world[:, :, 3])
+        if not metrics.scene_scale(centres) > SAME_PLACE * np.abs(centres).max():
+            text = f"{each.name} has all its cameras at one place; distances there mean nothing."
+            raise EvaluationError(text)
 
 
 def _write(rows: Sequence[Row], output: Path | None) -> None:

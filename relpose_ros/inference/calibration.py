@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from relpose_ros.errors import RelPoseError
 from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.global_rotations import solve
 from relpose_ros.inference.outlines import position_sigmas, sighted_translations, sightlines
@@ -48,6 +49,10 @@ TEMPERATURES = (1 / 32, 32.0)
 """Range in which the temperature is looked for. The log-likelihood of a share is concave in 1/T."""
 
 
+class CalibrationError(RelPoseError):
+    """A calibration that is none: estimates that rest on it would be called enough for no reason."""
+
+
 @dataclass(frozen=True)
 class Calibration:
     """What turns energies into probabilities that hold. The defaults are those of an uncalibrated network."""
@@ -77,13 +82,28 @@ class Calibration:
 
     @classmethod
     def from_json(cls, text: str) -> Calibration:
-        """Reads what `to_json` wrote; other keys (a report kept beside it) are passed over."""
-        stored = json.loads(text)
-        known = {field.name: stored[field.name] for field in fields(cls) if field.name in stored}
-        for several in ("position_sigma", "match_trust"):
-            if known.get(several) is not None:
-                known[several] = tuple(float(number) for number in known[several])
-        return cls(**known)
+        """Reads what `to_json` wrote; other keys (a report kept beside it) are passed over.
+
+        Raises:
+            CalibrationError: It is something else, or says nothing of the temperature.
+        """
+        try:
+            stored = json.loads(text)
+            known = {field.name: stored[field.name] for field in fields(cls) if field.name in stored}
+            for several in ("position_sigma", "match_trust"):
+                if known.get(several) is not None:
+                    known[several] = tuple(float(number) for number in known[several])
+            found = cls(**known)
+            numbers = [found.temperature, found.pair_spread, found.rotation_spread, *found.position_sigma]
+            sound = all(math.isfinite(number) and number > 0 for number in numbers) and 0 <= found.flat < 1
+            sound &= found.match_trust is None or (
+                len(found.match_trust) == 4 and all(map(math.isfinite, found.match_trust))
+            )
+        except (ValueError, TypeError, AttributeError) as err:
+            raise CalibrationError(f"the calibration cannot be read: {err}; calibrate anew.") from err
+        if not sound or "temperature" not in known:
+            raise CalibrationError(f"the calibration makes no sense: {text[:200]}; calibrate anew.")
+        return found
 
 
 @dataclass(frozen=True, eq=False)

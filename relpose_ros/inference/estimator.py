@@ -17,7 +17,7 @@ from relpose_ros.errors import RelPoseError
 from relpose_ros.estimates import CameraPose, ScanEstimate, Verdict
 from relpose_ros.geometry import cameras, so3_grid
 from relpose_ros.inference import bundle_adjustment
-from relpose_ros.inference.calibration import Calibration
+from relpose_ros.inference.calibration import Calibration, CalibrationError
 from relpose_ros.inference.camera_positions import apart, baseline, joined, place
 from relpose_ros.inference.evidence import SHIPPED, EvidenceSettings
 from relpose_ros.inference.global_rotations import joint_scores, solve
@@ -48,7 +48,7 @@ from relpose_ros.inference.uncertainty import (
     pairs_of_unknown_trust,
 )
 from relpose_ros.inference.verdict import WITHOUT_PROBABILITIES, judge
-from relpose_ros.network.checkpoint import load_network, read_metadata
+from relpose_ros.network.checkpoint import NetworkFileError, load_network, read_metadata
 from relpose_ros.network.crops import crop_square, crop_view
 from relpose_ros.network.features import ViewFeatures
 from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
@@ -193,7 +193,7 @@ class Estimator:
             backbone_in_bfloat16: of the published network: sooner on some processors, and less exact.
 
         Raises:
-            NetworkFileError: if the file is missing or is none of ours.
+            NetworkFileError: if the file is missing or is none of ours, or its calibration is none.
         """
         if threads is not None:
             torch.set_num_threads(threads or OWN_THREADS)
@@ -204,7 +204,11 @@ class Estimator:
         network = load_network(path)
         network.backbone_in_bfloat16 = backbone_in_bfloat16
         stored = read_metadata(path).get("calibration")
-        return cls(network, Calibration.from_json(stored) if stored else None, evidence)
+        try:
+            calibration = None if stored is None else Calibration.from_json(stored)
+        except CalibrationError as err:
+            raise NetworkFileError(f"{path}: {err}") from err
+        return cls(network, calibration, evidence)
 
     @property
     def preset(self) -> Preset:

@@ -35,6 +35,8 @@ CAMERA_FRAME = "camera_optical_frame"
 WORLD_FRAME = "capture_world"
 START_NS = 1_000_000_000
 """A capture knows no time. Not zero, which ROS reads as "no stamp"."""
+LAST_STAMP_S = 2.0**31
+"""A stamp's seconds are an int32."""
 
 logger = logging.getLogger("relpose_ros")
 
@@ -71,8 +73,10 @@ def pack(
         raise BagError(text)
     if not len(chosen):
         raise BagError(f"No photo of {capture} was chosen; leave the choice out to pack all of them.")
-    if not period_s > 0:
-        raise BagError(f"The time between two photos is {period_s} s; it must be positive.")
+    last_s = START_NS / 1e9 + len(chosen) * period_s
+    if not (period_s * 1e9 >= 1 and last_s < LAST_STAMP_S):  # nor is either of what is no number
+        text = f"The time between two photos is {period_s} s; it must be a nanosecond or more, and the last "
+        raise BagError(f"{text}photo's stamp one that ROS can write, before the year 2038.")
     photos = [loaded.photos[k] for k in chosen]
     posed = any(photo.camera_from_world is not None for photo in photos)
     with BagWriter(output) as bag:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import resource
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -75,7 +77,8 @@ class Scans:
                     sizes = f"{shard[name].shape[2:]} and {shards[0][name].shape[2:]}"
                     text = f"shards of {name} of {sizes} do not mix; render them alike."
                     raise ShardError(text)
-        self._shards = list(shards)
+        # What is not read is not kept: each array holds a file open.
+        self._shards = [{name: shard[name] for name in self._fields} for shard in shards]
         self._ends = np.cumsum([len(shard["places"]) for shard in shards])
 
     def __len__(self) -> int:
@@ -114,9 +117,18 @@ def open_scans(folders: Iterable[Path]) -> Scans:
     """All shards under the given folders, memory-mapped, in order of their names.
 
     Raises:
-        ShardError: as `Scans`.
+        ShardError: as `Scans`; or the system opens no more files.
     """
-    return Scans([read_shard(path) for path in shards_in(list(folders))])
+    paths = shards_in(list(folders))
+    with contextlib.suppress(ValueError, OSError):  # some systems have a lower limit than they say
+        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    try:
+        return Scans([read_shard(path) for path in paths])
+    except OSError as err:
+        raise ShardError(
+            f"{len(paths)} shards cannot be opened: {err.strerror}; make fewer, larger ones."
+        ) from err
 
 
 @dataclass(frozen=True)

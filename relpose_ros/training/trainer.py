@@ -58,6 +58,8 @@ PIECE_BYTES = 16 * 2**20
 """Size of the pieces a checkpoint is cut into, so that it passes through stores that refuse large files."""
 _BACKBONE = "feature_extractor.feature_extractor."
 """How the names of its weights begin."""
+MEASURED_VIEWS = 4
+"""Of each held-out scan."""
 CURVE = "curve.csv"
 WEIGHTS = "weights.safetensors"
 _COLUMNS = ("step", "images", "seconds", "images_per_second", "learning_rate", "max_angle")
@@ -244,6 +246,9 @@ class Trainer:
             self._resume()
         elif start_from is not None:
             self._begin_with(start_from)
+        if not goes_on and self._rank == 0:
+            (folder / CURVE).unlink(missing_ok=True)  # of a run that ended before its first checkpoint
+        self._require_same_start()
 
     @property
     def finished(self) -> bool:
@@ -286,9 +291,9 @@ class Trainer:
                     speed = (self.images - last[0]) / (now - last[1])
                     last = (self.images, now)
                     bar.set_postfix_str(f"rotation {means[1]:.2f}, {speed:.0f} images/s")
+                    if check:
+                        self.save()  # a measurement that fails must not take the steps with it
                     self._log(means, speed, self.measure() if check else {})
-                if check:
-                    self.save()
         self.save()
 
     def train_step(self) -> torch.Tensor:
@@ -328,7 +333,7 @@ class Trainer:
         """Largest angle between views and the one they surround, for the coming step, degrees."""
         return _max_angle(self.settings, self.images)
 
-    def measure(self, views: int = 4, count: int = 32) -> dict[str, float]:
+    def measure(self, views: int = MEASURED_VIEWS, count: int = 32) -> dict[str, float]:
         """Accuracy of single pairs on the held-out scans, by the averaged weights; empty without any."""
         if self._held_out is None or self._rank > 0:
             return {}
@@ -414,9 +419,39 @@ class Trainer:
         for network in (self.network, self.average):
             network.load_state_dict(state)
         self.images = self._began = int(read_metadata(weights).get("images_seen", "0"))
+        if self.finished:
+            asked = self.settings.images
+            text = f"{weights} has seen {self.images} images, all in all {asked} are asked for: ask for more."
+            raise TrainingError(text)
+
+    def _require_same_start(self) -> None:
+        """Refuse processes of which some found a checkpoint and some did not."""
+        if self._processes == 1:
+            return
+        own = torch.tensor([self.step, self.images], device=self._device)
+        others = [torch.empty_like(own) for _ in range(self._processes)]
+        distributed.all_gather(others, own)
+        if any(not other.equal(own) for other in others):
+            text = (
+                f"the processes begin at different steps ({', '.join(str(int(o[0])) for o in others)}): "
+                f"{self.folder} must be one folder that all machines share."
+            )
+            raise TrainingError(text)
 
     def _check_fit(self, scans: Scans, held_out: Scans | None) -> None:
-        """Refuse maps of a backbone that this network does not read, or would train on."""
+        """Refuse scans of too few views, and maps of a backbone that this network reads not, or trains."""
+        most = self.settings.max_views
+        if scans.views < most:
+            text = (
+                f"there are shards of scans of {scans.views} views only, and up to {most} are drawn of each: "
+                "leave them out, or make others."
+            )
+            raise TrainingError(text)
+        if held_out is not None and held_out.views < MEASURED_VIEWS:
+            text = (
+                f"there are held-out scans of {held_out.views} views only; measuring takes {MEASURED_VIEWS}."
+            )
+            raise TrainingError(text)
         shapes = self.network.feature_extractor.summarised_shapes
         for each in (scans, *([] if held_out is None else [held_out])):
             if each.map_shapes and not (self.settings.pretrained_backbone and each.map_shapes == shapes):

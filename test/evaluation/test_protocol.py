@@ -182,6 +182,19 @@ def test_wrong_questions_are_answered_with_a_sentence():
         protocol.evaluate([], progress=False)
     with pytest.raises(EvaluationError, match="between 2 and 8"):
         protocol.evaluate([posed()], [1, 2], methods=["identity"], progress=False)
+    few = replace(posed(), camera_from_world=posed().camera_from_world[:3])
+    with pytest.raises(EvaluationError, match="no capture has 5 views with a pose, the most have 3"):
+        protocol.evaluate([few], [5, 8], methods=["identity"], progress=False)
+    for orders, seed in ((0, 0), (5, -1)):
+        with pytest.raises(EvaluationError, match=f"{orders} orders by the seed {seed}"):
+            protocol.evaluate([posed()], [2], seed=seed, orders=orders, methods=["identity"], progress=False)
+    place = [1.0, 2.0, 3.0]
+    turns = posed().camera_from_world[:, :, :3]
+    turned = replace(
+        posed(), camera_from_world=np.concatenate([turns, -turns @ np.reshape(place, (3, 1))], 2)
+    )
+    with pytest.raises(EvaluationError, match="all its cameras at one place"):
+        protocol.evaluate([turned], [2], methods=["identity"], progress=False)
     with pytest.raises(EvaluationError, match="magic"):
         protocol.evaluate([posed()], [2], methods=["magic"], progress=False)
 

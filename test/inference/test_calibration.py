@@ -10,6 +10,7 @@ import torch
 from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.calibration import (
     Calibration,
+    CalibrationError,
     expected_calibration_error,
     fit_calibration,
     measure_calibration,
@@ -117,6 +118,20 @@ def test_kept_with_the_weights_as_text():
     assert Calibration.from_json('{"temperature": 2.0, "report": {"pairs": 3}}') == Calibration(
         temperature=2.0
     )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("[]", "{}", "{temperature: 1}", '"text"', "null", '{"flat": 0.2}', '{"temperature": "warm"}'),
+        *('{"temperature": 0}', '{"temperature": NaN}', '{"temperature": 1, "flat": 1}'),
+        *('{"temperature": 1, "position_sigma": 3}', '{"temperature": 1, "position_sigma": [0, 1]}'),
+        '{"temperature": 1, "match_trust": [1, 2]}',
+    ],
+)
+def test_what_is_no_calibration_counts_as_none(text):
+    with pytest.raises(CalibrationError, match="calibrate anew"):
+        Calibration.from_json(text)
 
 
 def test_expected_calibration_error_by_hand():

@@ -19,7 +19,7 @@ from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.estimator import OWN_THREADS, Estimator, EvidenceSettings, ScanError
 from relpose_ros.inference.outlines import find_outline, sighted_translations
 from relpose_ros.inference.predictions import about_the_object, predicted_translations, regressed_poses
-from relpose_ros.network.checkpoint import random_network, write_network
+from relpose_ros.network.checkpoint import NetworkFileError, random_network, write_network
 from relpose_ros.network.crops import crop_square
 from relpose_ros.network.features import SceneFeatures
 from relpose_ros.network.presets import PRESETS, named_preset
@@ -193,6 +193,13 @@ def test_threads_do_not_mix_scans(network):
     for thread in threads:
         thread.join()
     assert together == alone
+
+
+def test_weights_with_a_broken_calibration_are_refused(network, tmp_path):
+    file = tmp_path / "broken.safetensors"
+    write_network(network, file, {"calibration": "[]"})
+    with pytest.raises(NetworkFileError, match=r"broken.safetensors: the calibration makes no sense"):
+        Estimator.from_weights(file)
 
 
 def test_weights_bring_their_calibration(network, tmp_path):

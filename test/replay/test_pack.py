@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import cv2
@@ -135,8 +136,9 @@ def test_what_cannot_be_packed_is_told(tmp_path: Path, capture: tuple[Path, Any]
         pack(folder, tmp_path / "bag", views=[0, 5])
     with pytest.raises(BagError, match="No photo"):
         pack(folder, tmp_path / "bag", views=[])
-    with pytest.raises(BagError, match="must be positive"):
-        pack(folder, tmp_path / "bag", period_s=0)
+    for period in (0, -1, 1e-10, 2e9, math.inf, math.nan):
+        with pytest.raises(BagError, match="a nanosecond or more"):
+            pack(folder, tmp_path / "bag", period_s=period)
     with pytest.raises(CaptureError):
         pack(tmp_path / "nowhere", tmp_path / "bag")
     assert not (tmp_path / "bag").exists()

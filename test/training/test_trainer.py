@@ -114,6 +114,38 @@ def test_given_weights_that_do_not_say_what_they_saw_are_kept_all_the_same(tmp_p
     assert 0 < (weights(run.average) - before).norm() < 0.01 * (weights(run.network) - before).norm()
 
 
+def test_weights_that_have_seen_all_that_is_asked_for_begin_no_run(tmp_path, scans):
+    given = tmp_path / "given.safetensors"
+    write_network(random_network(SETTINGS.network, 3), given, {"images_seen": str(SETTINGS.images)})
+    with pytest.raises(TrainingError, match=f"has seen {SETTINGS.images} images"):
+        Trainer(SETTINGS, tmp_path / "run", scans, start_from=given)
+
+
+def test_scans_of_too_few_views_are_refused_before_the_first_step(tmp_path, scans):
+    many = replace(SETTINGS, max_views=scans.views + 1)
+    with pytest.raises(TrainingError, match=f"scans of {scans.views} views only"):
+        Trainer(many, tmp_path / "run", scans)
+
+
+def test_a_measurement_that_fails_leaves_a_checkpoint(tmp_path, scans, monkeypatch):
+    run = Trainer(SETTINGS, tmp_path / "run", scans, scans)
+    monkeypatch.setattr(run, "measure", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run.run(check_every=4, progress=False)
+    assert Trainer(SETTINGS, tmp_path / "run", scans, scans).step == 4
+
+
+def test_the_curve_of_a_run_without_a_checkpoint_begins_anew(tmp_path, scans):
+    (tmp_path / "run").mkdir()
+    curve = tmp_path / "run" / trainer.CURVE
+    curve.write_text("step,images\n2,16\n", encoding="utf-8")
+    run = Trainer(SETTINGS, tmp_path / "run", scans)
+    run._out_of_time = lambda *_: run.step >= 2
+    run.run(log_every=2, progress=False)
+    with curve.open() as stream:
+        assert [row["step"] for row in csv.DictReader(stream)] == ["2"]
+
+
 def test_weights_of_another_network_begin_no_run(tmp_path, scans):
     Trainer(replace(SETTINGS, variants=("no-index",)), tmp_path / "first", scans).save()
     with pytest.raises(TrainingError, match=r"weights\.safetensors holds another network than 'tiny'"):
