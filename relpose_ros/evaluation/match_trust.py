@@ -17,7 +17,7 @@ import numpy as np
 from relpose_ros.geometry import so3
 from relpose_ros.inference.calibration import expected_calibration_error
 from relpose_ros.inference.local_features import find_features
-from relpose_ros.inference.matches import LARGEST_TRUST, TRUST
+from relpose_ros.inference.matches import TRUST, trust_of_signs
 from relpose_ros.inference.side_by_side import side_by_side
 from relpose_ros.inference.two_view_poses import explain
 
@@ -128,7 +128,7 @@ def fit_trust(pairs: MatchedPairs) -> tuple[float, ...] | None:
     """
     if min(np.count_nonzero(pairs.right), np.count_nonzero(~pairs.right)) < LEAST_OF_EACH:
         return None
-    design = _design(pairs)
+    design = np.concatenate([np.ones((len(pairs.right), 1)), pairs.signs], 1)
     coefficients = np.zeros(design.shape[1])
     penalty = RIDGE * np.diag(np.arange(design.shape[1]) > 0)
     for _ in range(30):
@@ -143,14 +143,10 @@ def measure_trust(pairs: MatchedPairs, coefficients: Sequence[float]) -> TrustRe
     """What such coefficients are worth, best asked of other pairs; None where none matched."""
     if len(pairs.right) == 0:
         return None
-    stated = LARGEST_TRUST / (1 + np.exp(-_design(pairs) @ np.array(coefficients)))
+    stated = np.array([trust_of_signs(signs, coefficients) for signs in pairs.signs])
     return TrustReport(
         pairs=len(stated),
         right=float(pairs.right.mean()),
         stated=float(stated.mean()),
         expected_calibration_error=expected_calibration_error(stated, pairs.right),
     )
-
-
-def _design(pairs: MatchedPairs) -> FloatArray:
-    return np.concatenate([np.ones((len(pairs.right), 1)), pairs.signs], 1)

@@ -72,8 +72,6 @@ SHOWN = {
     "seconds": "seconds",
 }
 """The columns of a table, and their heads: rotation, camera centre, translation."""
-
-
 SAME_PLACE = 1e-9
 """Of the distance from a world's origin: cameras no further from each other stand at one place."""
 

@@ -111,8 +111,13 @@ def trust(support: Support, coefficients: Sequence[float] = TRUST) -> float:
         coefficients: (4,) of the logistic regression; those of a network's descriptors are kept with its
             weights, as `Calibration.match_trust`.
     """
+    return trust_of_signs(support.signs, coefficients)
+
+
+def trust_of_signs(signs: FloatArray, coefficients: Sequence[float]) -> float:
+    """`trust` by the numbers that it goes by, `Support.signs`."""
     bias, *slopes = coefficients
-    return LARGEST_TRUST / (1 + math.exp(-(bias + float(support.signs @ slopes))))
+    return LARGEST_TRUST / (1 + math.exp(-(bias + float(signs @ slopes))))
 
 
 class Matcher:
