@@ -591,7 +591,7 @@ def _shard(arguments: argparse.Namespace) -> int:
 def _features(arguments: argparse.Namespace) -> int:
     from relpose_ros.training.batches import Augmentation
     from relpose_ros.training.feature_shards import write_feature_shards
-    from relpose_ros.training.trainer import initial_network, settings_for
+    from relpose_ros.training.settings import initial_network, settings_for
 
     write_feature_shards(
         arguments.output,
@@ -608,7 +608,8 @@ def _train(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from relpose_ros.training.batches import open_scans
-    from relpose_ros.training.trainer import Trainer, settings_for
+    from relpose_ros.training.settings import settings_for
+    from relpose_ros.training.trainer import Trainer
 
     settings = replace(settings_for(arguments.preset, arguments.variant), seed=arguments.seed)
     if arguments.images is not None:

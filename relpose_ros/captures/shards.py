@@ -17,18 +17,21 @@ A shard is a folder of .npy files with one row per scan, all of them memory-mapp
     motion.npy              (M,) uint8: 0 camera, 1 turntable, 2 handled
     names.npy               (M,) text
 
-Shard k holds the scans k M to k M + M - 1 of its seed; a shard that stands in its place is whole.
+Beside them plan.json says how the shard was made. Shard k holds the scans k M to k M + M - 1 of its seed; a
+shard that stands in its place is whole.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import multiprocessing
 import shutil
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -38,18 +41,28 @@ from relpose_ros.captures.assets import load_assets
 from relpose_ros.captures.renderer import RenderError
 from relpose_ros.captures.scans import PLACE_STRIDE, RenderedScan, ScanRenderer
 from relpose_ros.captures.scenes import Motion, ScanStyle
+from relpose_ros.errors import RelPoseError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     import numpy.typing as npt
 
+    Arrays = Mapping[str, npt.NDArray[Any]]
+    Plan = Mapping[str, Any]
+    """How a shard was made, as JSON keeps it."""
 
+
+PLAN = "plan.json"
 _UNFINISHED = ".unfinished"
 _LOG = logging.getLogger(__name__)
 _MAX_FRUITLESS = 3
 """So many times in a row all processes may die before a shard is whole."""
+
+
+class ShardError(RelPoseError):
+    """A folder holds no shards, or shards of another kind, or none can be written there."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +79,11 @@ class ShardPlan:
     split: str = "train"
     style: ScanStyle = field(default_factory=ScanStyle)
 
+    def as_json(self) -> dict[str, Any]:
+        """What is kept beside the shards."""
+        assets = None if self.assets is None else str(self.assets.resolve())
+        return {"made": "rendered", **asdict(self), "assets": assets}
+
 
 def write_shards(folder: Path, count: int, plan: ShardPlan, *, processes: int = 1) -> None:
     """Write shards 0 to count - 1 of a plan; those that stand already are left alone.
@@ -81,9 +99,9 @@ def write_shards(folder: Path, count: int, plan: ShardPlan, *, processes: int = 
     Raises:
         RenderError: There is no OpenGL here, or all that draws dies.
         AssetsError: The assets folder is not one.
+        ShardError: Shards of another plan stand there, or none can be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    missing = _missing(folder, count)
+    missing = _missing(folder, count, plan)
     with tqdm(total=len(missing), unit="shard", desc=f"{plan.scans * plan.views} images each") as progress:
         fruitless = 0
         while missing:
@@ -92,11 +110,12 @@ def write_shards(folder: Path, count: int, plan: ShardPlan, *, processes: int = 
             if fruitless == _MAX_FRUITLESS:
                 text = f"the processes that draw shards of {folder} die; the graphics driver may be at fault."
                 raise RenderError(text)
-            missing = _missing(folder, count)
+            missing = _missing(folder, count, plan)
 
 
-def _missing(folder: Path, count: int) -> list[int]:
-    return [k for k in range(count) if not (folder / f"{k:05d}").exists()]
+def _missing(folder: Path, count: int, plan: ShardPlan) -> list[int]:
+    made = plan.as_json()
+    return [k for k in range(count) if not stands(folder / f"{k:05d}", made)]
 
 
 def _write_some(
@@ -122,17 +141,52 @@ def _write_some(
     return done
 
 
+def stands(folder: Path, plan: Plan) -> bool:
+    """Whether a shard stands in its place, so that it need not be made again.
+
+    Raises:
+        ShardError: It does, and was made by another plan. One without a plan counts as made by this one.
+    """
+    path = folder / PLAN
+    if path.exists():
+        made, asked = json.loads(path.read_text(encoding="utf-8")), json.loads(json.dumps(plan))
+        for name in {**asked, **made}:
+            if made.get(name) != asked.get(name):
+                text = (
+                    f"{folder} was made with {name} {made.get(name)!r}, not {asked.get(name)!r}: "
+                    "name another folder, or remove that one."
+                )
+                raise ShardError(text)
+    return folder.exists()
+
+
 @contextmanager
-def new_shard(folder: Path) -> Iterator[dict[str, npt.NDArray[Any]]]:
-    """Arrays to fill, by their names, which stand in their place as a shard when all are whole."""
+def new_shard(folder: Path, plan: Plan) -> Iterator[dict[str, npt.NDArray[Any]]]:
+    """Arrays to fill, by their names, which stand in their place as a shard when all are whole.
+
+    Raises:
+        ShardError: They cannot be written.
+    """
     unfinished = folder.with_name(folder.name + _UNFINISHED)
     shutil.rmtree(unfinished, ignore_errors=True)  # of a run that was cut off
-    unfinished.mkdir(parents=True)
+    with _written(folder):
+        unfinished.mkdir(parents=True)
     arrays: dict[str, npt.NDArray[Any]] = {}
     yield arrays
-    for name, array in arrays.items():
-        np.save(unfinished / f"{name}.npy", array)
-    unfinished.rename(folder)
+    with _written(folder):
+        (unfinished / PLAN).write_text(json.dumps(plan, indent=1) + "\n", encoding="utf-8")
+        for name, array in arrays.items():
+            np.save(unfinished / f"{name}.npy", array)
+        unfinished.rename(folder)
+
+
+@contextmanager
+def _written(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as err:
+        text = f"{folder} cannot be written: {err.strerror or err}; make room, or name another place."
+        raise ShardError(text) from err
 
 
 def shard_folders(folders: Iterable[Path]) -> list[Path]:
@@ -141,9 +195,31 @@ def shard_folders(folders: Iterable[Path]) -> list[Path]:
     return sorted(path for path in found if path.suffix != _UNFINISHED)
 
 
-def read_shard(folder: Path) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of one shard by name, memory-mapped."""
-    return {path.stem: np.load(path, mmap_mode="r") for path in sorted(folder.glob("*.npy"))}
+class Shard(Mapping[str, "npt.NDArray[Any]"]):
+    """The arrays of one shard by name, each memory-mapped when it is asked for.
+
+    None is held open: with a shard of every sequence of CO3D there are more than a system opens at once.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Look at the names alone."""
+        self._folder = folder
+        self._names = sorted(path.stem for path in folder.glob("*.npy"))
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        """An array, opened now."""
+        if name not in self._names:
+            raise KeyError(name)
+        array: npt.NDArray[Any] = np.load(self._folder / f"{name}.npy", mmap_mode="r")
+        return array
+
+    def __iter__(self) -> Iterator[str]:
+        """The names."""
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        """How many arrays."""
+        return len(self._names)
 
 
 _renderers: dict[ShardPlan, ScanRenderer] = {}
@@ -156,7 +232,7 @@ def _write_shard(folder: Path, plan: ShardPlan, number: int) -> None:
         _renderers[plan] = ScanRenderer(plan.seed, plan.image_size, assets=assets, style=plan.style)
     renderer = _renderers[plan]
     m, n, s, cells = plan.scans, plan.views, plan.image_size, plan.image_size // PLACE_STRIDE
-    with new_shard(folder / f"{number:05d}") as arrays:
+    with new_shard(folder / f"{number:05d}", plan.as_json()) as arrays:
         arrays.update(
             images=np.empty((m, n, s, s, 3), np.uint8),
             places=np.empty((m, n, cells, cells, 3), np.float16),
@@ -175,7 +251,7 @@ def _write_shard(folder: Path, plan: ShardPlan, number: int) -> None:
             _fill(arrays, row, renderer.scan(number * m + row, n))
 
 
-def _fill(arrays: Mapping[str, npt.NDArray[Any]], row: int, scan: RenderedScan) -> None:
+def _fill(arrays: Arrays, row: int, scan: RenderedScan) -> None:
     for name in (
         "images",
         "places",

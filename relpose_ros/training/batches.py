@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import resource
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +9,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from relpose_ros.captures.shards import read_shard, shard_folders
-from relpose_ros.errors import RelPoseError
+from relpose_ros.captures.shards import Shard, ShardError, shard_folders
 from relpose_ros.network.crops import IMAGE_MEAN, IMAGE_STD
 from relpose_ros.training.objective import Batch
 
@@ -22,6 +19,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
+    from relpose_ros.captures.shards import Arrays
     from relpose_ros.training.objective import Looks
 
     FloatArray = npt.NDArray[np.float64]
@@ -39,15 +37,15 @@ DRAWS = 20
 _HOW_TO_MAKE_SHARDS = "make some with 'relpose_ros render DIR --as shards'"
 
 
-class ShardError(RelPoseError):
-    """A folder holds no shards, or shards of another kind."""
-
-
 class Scans:
     """Scans, a row each, in any number of shards. The arrays stay where they are, for instance on disk."""
 
-    def __init__(self, shards: Sequence[Mapping[str, npt.NDArray[Any]]]) -> None:
-        """Take shards as `read_shard` gives them.
+    def __init__(self, shards: Sequence[Arrays], *, first_map: bool = False) -> None:
+        """Take shards, such as those that `Shard` reads.
+
+        Args:
+            shards: Their arrays by name.
+            first_map: Whether to read the first of their maps alone, where they hold maps.
 
         Raises:
             ShardError: There are none, or they differ in the size of their images, or in the backbone that
@@ -63,6 +61,8 @@ class Scans:
         }
         """(C, h, w) by stage, of the backbone whose maps are there instead of images; empty where there are
         images."""
+        if first_map:
+            self.map_shapes = dict(list(self.map_shapes.items())[:1])
         looks = [MAP.format(stage) for stage in self.map_shapes] or ["images"]
         self._fields = (*looks, *FIELDS)
         for shard in shards:
@@ -73,26 +73,22 @@ class Scans:
                 text = f"a shard lacks {missing[0]}.npy; render it again."
                 raise ShardError(text)
             for name in looks:
-                if shard[name].shape[2:] != shards[0][name].shape[2:]:
-                    sizes = f"{shard[name].shape[2:]} and {shards[0][name].shape[2:]}"
+                if (shape := shard[name].shape[2:]) != shards[0][name].shape[2:]:
+                    sizes = f"{shape} and {shards[0][name].shape[2:]}"
                     text = f"shards of {name} of {sizes} do not mix; render them alike."
                     raise ShardError(text)
-        # What is not read is not kept: each array holds a file open.
-        self._shards = [{name: shard[name] for name in self._fields} for shard in shards]
-        self._ends = np.cumsum([len(shard["places"]) for shard in shards])
+        self._shards = shards
+        shapes = [shard["camera_from_object"].shape for shard in shards]
+        self._ends = np.cumsum([scans for scans, *_ in shapes])
+        self.views = min(views for _, views, *_ in shapes)
+        """Views that every scan has at least."""
 
     def __len__(self) -> int:
         return int(self._ends[-1])
 
-    @property
-    def views(self) -> int:
-        """Views that every scan has at least."""
-        return min(int(shard["places"].shape[1]) for shard in self._shards)
-
     def first_maps(self) -> Scans:
         """The same scans with the first of their maps alone, for a backbone that is trained from there on."""
-        later = {MAP.format(stage) for stage in self.map_shapes if stage > min(self.map_shapes)}
-        return Scans([{name: shard[name] for name in shard if name not in later} for shard in self._shards])
+        return Scans(self._shards, first_map=True)
 
     def row(self, index: int) -> dict[str, npt.NDArray[Any]]:
         """One scan: its images or maps and the arrays of `FIELDS`, without copying them."""
@@ -117,18 +113,9 @@ def open_scans(folders: Iterable[Path]) -> Scans:
     """All shards under the given folders, memory-mapped, in order of their names.
 
     Raises:
-        ShardError: as `Scans`; or the system opens no more files.
+        ShardError: as `Scans`.
     """
-    paths = shards_in(list(folders))
-    with contextlib.suppress(ValueError, OSError):  # some systems have a lower limit than they say
-        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    try:
-        return Scans([read_shard(path) for path in paths])
-    except OSError as err:
-        raise ShardError(
-            f"{len(paths)} shards cannot be opened: {err.strerror}; make fewer, larger ones."
-        ) from err
+    return Scans([Shard(path) for path in shards_in(list(folders))])
 
 
 @dataclass(frozen=True)

@@ -6,22 +6,22 @@ place of the images: see `relpose_ros.training.batches.MAP`. About 45 kB an imag
 
 from __future__ import annotations
 
+import json
 import zlib
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
-from relpose_ros.captures.shards import new_shard, read_shard
-from relpose_ros.training.batches import FIELDS, MAP, ShardError, augmented, normalised, shards_in
+from relpose_ros.captures.shards import PLAN, Shard, ShardError, new_shard, stands
+from relpose_ros.training.batches import FIELDS, MAP, augmented, normalised, shards_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
-
-    import numpy.typing as npt
 
     from relpose_ros.network.relpose import RelPose
     from relpose_ros.training.batches import Augmentation
@@ -40,7 +40,7 @@ def write_feature_shards(
     """Write ``copies`` shards of each shard, with a progress bar; those that stand already are left alone.
 
     Args:
-        folder: Gets a sub-folder for each. Copies, changes and seed must be the same when it is continued.
+        folder: Gets a sub-folder for each. Changes and seed must be the same when it is continued.
         sources: Folders of shards of images.
         network: Whose backbone looks, and whose other parts say which stages' maps are read.
         copies: How often each scan is changed at random and looked at.
@@ -51,8 +51,8 @@ def write_feature_shards(
         How many there are.
 
     Raises:
-        ShardError: There are no shards of images of the network's size there, two have one name, or no copies
-            or several alike are asked for.
+        ShardError: There are no shards of images of the network's size there, two have one name, no copies
+            or several alike are asked for, or what stands in the folder was made otherwise.
     """
     if copies < 1 or (copies > 1 and augmentation is None):
         text = f"{copies} copies cannot be made; ask for 1 or more, and for 1 of scans as they are."
@@ -63,8 +63,16 @@ def write_feature_shards(
     if doubled := [path for name, path in wanted if names[name] > 1]:
         text = f"{doubled[0]} and {doubled[1]} would have one name; rename the folder above one of them."
         raise ShardError(text)
+    made = {
+        "made": "features",
+        "network": network.preset.name,
+        "augmentation": None if augmentation is None else asdict(augmentation),
+        "seed": seed,
+    }
     for name, path in tqdm(wanted, unit="shard"):
-        if (folder / name).exists():
+        source_plan = json.loads((path / PLAN).read_text(encoding="utf-8")) if (path / PLAN).exists() else {}
+        plan = {**made, **{f"source's {name}": value for name, value in source_plan.items()}}
+        if stands(folder / name, plan):
             continue
         source = _images_for(network, path)
         generator = np.random.default_rng(zlib.crc32(f"{seed} {name}".encode()))
@@ -78,15 +86,15 @@ def write_feature_shards(
             for stage in network.feature_extractor.summarised_shapes:
                 row[MAP.format(stage)] = maps[stage].half().cpu().numpy()
             rows.append(row)
-        with new_shard(folder / name) as arrays:
+        with new_shard(folder / name, plan) as arrays:
             for field in rows[0]:
                 arrays[field] = np.stack([row[field] for row in rows])
             arrays["places"] = arrays["places"].astype(np.float16)
     return len(wanted)
 
 
-def _images_for(network: RelPose, path: Path) -> dict[str, npt.NDArray[Any]]:
-    source = read_shard(path)
+def _images_for(network: RelPose, path: Path) -> Shard:
+    source = Shard(path)
     if missing := [field for field in ("images", *FIELDS) if field not in source]:
         text = f"{path} has no {missing[0]}.npy: it is no shard of images; name those that it was made of."
         raise ShardError(text)

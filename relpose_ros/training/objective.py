@@ -9,8 +9,8 @@ by the inverse of its density, which sharpens the energy where uniform samples a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -65,6 +65,12 @@ class Batch:
     places: torch.Tensor | None = None
     """(B, N, h, w, 3) object coordinates each local descriptor sees, nan off the object; None if unknown."""
 
+    def looks_on(self, device: torch.device) -> Looks:
+        """The images or maps, moved to a device."""
+        if isinstance(self.looks, torch.Tensor):
+            return self.looks.to(device)
+        return [None if each is None else each.to(device) for each in self.looks]
+
 
 @dataclass(frozen=True, eq=False)
 class Targets:
@@ -90,6 +96,13 @@ class Targets:
     asked: torch.Tensor | None
     """(2, B, P, K) places, by rows of the map, of views i and of views j that are asked for their match;
     None where matches are not learned."""
+
+    def to(self, device: torch.device) -> Targets:
+        """The same on a device."""
+        moved: dict[str, Any] = {
+            name: value.to(device) for name, value in vars(self).items() if isinstance(value, torch.Tensor)
+        }
+        return replace(self, **moved)
 
 
 def rotations_near(

@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from relpose_ros.captures.scans import PLACE_STRIDE
-from relpose_ros.captures.shards import new_shard, read_shard
+from relpose_ros.captures.shards import new_shard, stands
 from relpose_ros.errors import RelPoseError
 from relpose_ros.network.crops import IMAGE_MEAN, IMAGE_STD, crop_view
 
@@ -107,32 +107,29 @@ def write_capture_shards(
         How many captures there were.
 
     Raises:
-        CaptureShardError: There are no copies to make, two captures have one name, or a shard that stands
-            there has crops of another size or number.
+        CaptureShardError: There are no copies to make, or two captures have one name.
+        ShardError: A shard that stands there was made otherwise, or none can be written.
     """
     if copies < 1 or not 0 <= masked_copies <= copies:
         text = f"{copies} copies, {masked_copies} of them masked, cannot be made; ask for 1 or more."
         raise CaptureShardError(text)
+    plan = {
+        "made": "photographs",
+        "preset": preset.name,
+        "image_size": preset.image_size,
+        "copies": copies,
+        "masked_copies": masked_copies,
+        "seed": seed,
+    }
     written: set[str] = set()
     for capture in tqdm(captures, unit="capture"):
         if capture.name in written:
             text = f"two captures are called {capture.name}; rename the folder of one, {capture.folder}."
             raise CaptureShardError(text)
         written.add(capture.name)
-        if (folder / capture.name).exists():
-            _check_alike(folder / capture.name, preset, copies)
+        if stands(folder / capture.name, plan):
             continue
         own_seed = zlib.crc32(f"{seed} {capture.name}".encode())
-        with new_shard(folder / capture.name) as arrays:
+        with new_shard(folder / capture.name, plan) as arrays:
             arrays |= capture_shard(capture, preset, copies, masked_copies=masked_copies, seed=own_seed)
     return len(written)
-
-
-def _check_alike(folder: Path, preset: Preset, copies: int) -> None:
-    stands, size = read_shard(folder)["images"].shape, preset.image_size
-    if (stands[0], stands[2]) != (copies, size):
-        text = (
-            f"{folder} has {stands[0]} copies of {stands[2]} pixels, not {copies} of {size}: name another "
-            "folder, or remove that one."
-        )
-        raise CaptureShardError(text)

@@ -8,54 +8,39 @@ from __future__ import annotations
 
 import copy
 import csv
-import hashlib
-import io
 import json
+import logging
 import os
+import signal
+import threading
 import time
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import distributed
 from torch.nn.parallel import DistributedDataParallel
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
-from relpose_ros.errors import RelPoseError
-from relpose_ros.geometry import so3, so3_grid
 from relpose_ros.network.checkpoint import load_network, random_network, read_metadata, write_network
 from relpose_ros.network.efficientnet import EfficientNetLite0
-from relpose_ros.network.presets import Preset, named_preset
-from relpose_ros.training.batches import Augmentation, Scans, make_batch
-from relpose_ros.training.imagenet import imagenet_backbone
-from relpose_ros.training.objective import (
-    Batch,
-    Objective,
-    ObjectiveSettings,
-    Targets,
-    make_targets,
-    scene_features,
-)
+from relpose_ros.network.presets import Preset
+from relpose_ros.training.checkpoints import LISTING, load_pieces, save_pieces
+from relpose_ros.training.objective import Objective
+from relpose_ros.training.pair_accuracy import ACCURACIES, pair_accuracy
+from relpose_ros.training.settings import TrainingError, TrainingSettings, initial_network
+from relpose_ros.training.steps import StepPlans, Steps
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    import numpy.typing as npt
+    from relpose_ros.training.batches import Scans
+    from relpose_ros.training.objective import Batch, Targets
 
-    from relpose_ros.network.features import SceneFeatures
-    from relpose_ros.network.relpose import RelPose
-    from relpose_ros.training.objective import Looks
-
-    State = dict[str, Any]
-    FloatArray = npt.NDArray[np.float64]
-    BestRotations = Callable[[RelPose, SceneFeatures, list[int], list[int]], FloatArray]
-    """(P, 3, 3) camera_j_from_camera_i of the pairs of one scan."""
-
-PIECE_BYTES = 16 * 2**20
-"""Size of the pieces a checkpoint is cut into, so that it passes through stores that refuse large files."""
+_LOG = logging.getLogger(__name__)
 _BACKBONE = "feature_extractor.feature_extractor."
 """How the names of its weights begin."""
 MEASURED_VIEWS = 4
@@ -64,98 +49,6 @@ CURVE = "curve.csv"
 WEIGHTS = "weights.safetensors"
 _COLUMNS = ("step", "images", "seconds", "images_per_second", "learning_rate", "max_angle")
 _LOSSES = ("loss", "rotation_nats", "translation", "match_nats")
-
-
-class TrainingError(RelPoseError):
-    """Training cannot start or go on."""
-
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """How a network is trained. `settings_for` gives those of a preset."""
-
-    preset: str = "compact"
-    variants: tuple[str, ...] = ()
-    """Ablations by their names in `relpose_ros.network.presets.VARIANTS`."""
-    images: int = 600_000
-    """Images seen in the whole run, each time an image is seen counting once."""
-    batch_images: int = 64
-    """Images a step and process: as many scans as fit."""
-    min_views: int = 2
-    max_views: int = 8
-    learning_rate: float = 6e-4
-    warmup_images: int = 12_000
-    decay: float = 0.4
-    """Share of the run, at its end, over which the learning rate falls to 0."""
-    weight_decay: float = 0.01
-    gradient_norm: float = 1.0
-    average_images: int = 20_000
-    """Images over which the averaged weights, those that are measured and written, forget."""
-    curriculum: tuple[tuple[float, float], ...] = ((0.0, 45.0), (0.25, 90.0), (0.5, 180.0))
-    """(share of the run, degrees): views of a scan lie within an angle of one of them, which is drawn
-    for each step between the first of these and the one that the run has come to."""
-    backbone_rate: float = 0.0
-    """Learning rate of a pretrained backbone as a share of the others'; 0 leaves it as it is. Its pointwise
-    convolutions learn, behind the first map that is read: on CPUs the others would take twice the time."""
-    precision: str = "bfloat16"
-    """Of the forward pass: float32, bfloat16, or float16 (GPU)."""
-    objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
-    augmentation: Augmentation = field(default_factory=Augmentation)
-    seed: int = 0
-
-    @property
-    def network(self) -> Preset:
-        """The preset with its variants."""
-        return named_preset(self.preset, self.variants)
-
-    @property
-    def pretrained_backbone(self) -> bool:
-        """Whether the backbone begins with the weights of `relpose_ros.training.imagenet`."""
-        return self.network.backbone == "efficientnet_lite0"
-
-
-def settings_for(preset: str, variants: Sequence[str] = ()) -> TrainingSettings:
-    """The published run for ``paper``, ours for ``compact``, and the same run for their variants.
-
-    Raises:
-        PresetError: There is no such preset or variant.
-    """
-    network = named_preset(preset, variants)
-    if preset == "paper":
-        settings = TrainingSettings(
-            preset="paper",
-            images=800_000 * 48 * 8,
-            batch_images=48 * 8,
-            learning_rate=1e-5,
-            warmup_images=0,
-            decay=0.0,
-            curriculum=((0.0, 180.0),),
-        )
-    else:
-        settings = TrainingSettings(
-            preset=preset,
-            precision="float32",  # few CPUs have another that is sooner
-            objective=ObjectiveSettings(
-                uniform_rotations=256, near_rotations=128, pairs=8, match_weight=0.5, match_places=40
-            ),
-        )
-    objective = settings.objective
-    if network.rotation == "regression":
-        # One rotation is predicted and none are compared: drawing many would be work for nothing.
-        objective = replace(objective, uniform_rotations=1, near_rotations=0)
-    return replace(settings, variants=tuple(variants), objective=objective)
-
-
-def initial_network(settings: TrainingSettings) -> RelPose:
-    """What a run begins with: weights drawn from its seed, and the backbone's own where it has some.
-
-    Raises:
-        PretrainedError: Those are not installed.
-    """
-    network = random_network(settings.network, settings.seed)
-    if settings.pretrained_backbone:
-        network.feature_extractor.feature_extractor.load_state_dict(imagenet_backbone().state_dict())
-    return network
 
 
 class Trainer:
@@ -189,7 +82,8 @@ class Trainer:
             compiled: Whether to compile the step first: minutes, for half as many images again afterwards.
 
         Raises:
-            TrainingError: The checkpoint is damaged, or it or the weights are of another network.
+            TrainingError: The checkpoint is damaged, or it or the weights are of another network; there is no
+                such device, or no folder can be made.
             NetworkFileError: The weights cannot be read.
             PretrainedError: The weights that the backbone begins with are not installed.
         """
@@ -198,9 +92,14 @@ class Trainer:
         self._workers = workers
         self._batches: Iterator[tuple[Batch, Targets]] | None = None
         self._device = _own_device(device)
+        _require(self._device)
         self._rank, self._processes = _join(self._device)
-        folder.mkdir(parents=True, exist_ok=True)
-        goes_on = (folder / "checkpoint.json").exists()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as err:
+            text = f"{folder} cannot be the folder of a run: {err.strerror}; name another."
+            raise TrainingError(text) from err
+        goes_on = (folder / LISTING).exists()
         network = random_network(settings.network, settings.seed) if goes_on else initial_network(settings)
         self.network = network.to(self._device).train()
         self.average = copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
@@ -265,11 +164,16 @@ class Trainer:
     ) -> None:
         """Train until the run is finished or the time is up, then write a checkpoint and the weights.
 
+        SIGINT (Ctrl-C) and SIGTERM end it after the step at hand; a second one ends it at once.
+
         Args:
             budget_s: Wall-clock seconds, None for no limit.
             log_every: Steps between rows of the curve.
             check_every: Steps between measurements on the held-out scans, checkpoints and weights.
             progress: Whether to show a progress bar on stderr.
+
+        Raises:
+            KeyboardInterrupt: It was ended by a signal; all steps are saved.
         """
         from tqdm import tqdm
 
@@ -277,8 +181,11 @@ class Trainer:
         before = self._seconds
         last = (self.images, started)
         hidden = not progress or self._rank > 0
-        with tqdm(total=self.settings.images, initial=self.images, unit="image", disable=hidden) as bar:
-            while not self.finished and not self._out_of_time(started, budget_s):
+        with (
+            _StopRequest() as stop,
+            tqdm(total=self.settings.images, initial=self.images, unit="image", disable=hidden) as bar,
+        ):
+            while not self.finished and not self._ends(stop, started, budget_s):
                 was = self.images
                 self.train_step()
                 bar.update(self.images - was)
@@ -294,7 +201,10 @@ class Trainer:
                     if check:
                         self.save()  # a measurement that fails must not take the steps with it
                     self._log(means, speed, self.measure() if check else {})
-        self.save()
+            self.save()
+        if stop.asked:
+            _LOG.info("stopped at step %d; the same command goes on.", self.step)
+            raise KeyboardInterrupt
 
     def train_step(self) -> torch.Tensor:
         """One update. -> (4,) total loss, rotation, translation, matches."""
@@ -331,7 +241,7 @@ class Trainer:
 
     def max_angle(self) -> float:
         """Largest angle between views and the one they surround, for the coming step, degrees."""
-        return _max_angle(self.settings, self.images)
+        return self.settings.max_angle(self.images)
 
     def measure(self, views: int = MEASURED_VIEWS, count: int = 32) -> dict[str, float]:
         """Accuracy of single pairs on the held-out scans, by the averaged weights; empty without any."""
@@ -482,8 +392,8 @@ class Trainer:
 
     def _next_batch(self) -> tuple[Batch, Targets]:
         if self._batches is None:
-            steps = _Steps(self.settings, self._scans, self._rank)
-            plan = _Plans(self.settings, self.step, self.images, self._processes)
+            steps = Steps(self.settings, self._scans, self._rank)
+            plan = StepPlans(self.settings, self.step, self.images, self._processes)
             loader: DataLoader[Any] = DataLoader(
                 steps, batch_size=None, sampler=plan, num_workers=self._workers
             )
@@ -496,22 +406,20 @@ class Trainer:
         mixed = precision is not torch.float32
         with torch.autocast(self._device.type, precision) if mixed else nullcontext():
             losses: torch.Tensor = self._objective(
-                _looks(batch, self._device),
+                batch.looks_on(self._device),
                 batch.crop_parameters.to(self._device),
-                _moved(targets, self._device),
+                targets.to(self._device),
             )
         return losses
 
-    def _out_of_time(self, started: float, budget_s: float | None) -> bool:
-        if budget_s is None:
-            return False
-        late = time.monotonic() - started > budget_s
+    def _ends(self, stop: _StopRequest, started: float, budget_s: float | None) -> bool:
+        ends = stop.asked or (budget_s is not None and time.monotonic() - started > budget_s)
         if self._processes > 1:
             # All stop at the same step, or those that go on would wait for ever.
-            flag = torch.tensor(float(late), device=self._device)
+            flag = torch.tensor(float(ends), device=self._device)
             distributed.all_reduce(flag, distributed.ReduceOp.MAX)
-            late = bool(flag.item())
-        return late
+            ends = bool(flag.item())
+        return ends
 
     def _log(self, means: Sequence[float], speed: float, accuracy: dict[str, float]) -> None:
         if self._rank > 0:
@@ -536,183 +444,46 @@ class Trainer:
             writer.writerow(row)
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """What a step needs to be drawn, wherever that happens."""
+class _StopRequest:
+    """Whether SIGINT or SIGTERM came while it is entered. The second of them does what it always did."""
 
-    step: int
-    views: int
-    max_angle: float
+    def __init__(self) -> None:
+        self.asked = False
+        self._before: dict[int, Any] = {}
 
+    def __enter__(self) -> _StopRequest:
+        if threading.current_thread() is threading.main_thread():  # no other may ask for signals
+            self._before = {each: signal.signal(each, self._ask) for each in (signal.SIGINT, signal.SIGTERM)}
+        return self
 
-class _Plans:
-    """The plans of all steps from one on. Every process has the same, so that none waits for another."""
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
 
-    def __init__(self, settings: TrainingSettings, step: int, images: int, processes: int) -> None:
-        self._settings, self._step, self._images, self._processes = settings, step, images, processes
-
-    def __iter__(self) -> Iterator[_Plan]:
-        settings, step, images = self._settings, self._step, self._images
-        while images < settings.images:
-            generator = np.random.default_rng([settings.seed, step])
-            views = int(generator.integers(settings.min_views, settings.max_views + 1))
-            # Near views go on being practised when far ones have begun.
-            angle = float(generator.uniform(settings.curriculum[0][1], _max_angle(settings, images)))
-            yield _Plan(step, views, angle)
-            images += _scans_of(settings, views) * views * self._processes
-            step += 1
-
-
-class _Steps(Dataset[tuple[Batch, Targets]]):
-    """Batch and targets of a planned step: a function of the plan, the seed and the rank alone."""
-
-    def __init__(self, settings: TrainingSettings, scans: Scans, rank: int) -> None:
-        self._settings, self._scans, self._rank = settings, scans, rank
-
-    def __getitem__(self, plan: _Plan) -> tuple[Batch, Targets]:
-        settings = self._settings
-        generator = np.random.default_rng([settings.seed, plan.step, self._rank])
-        batch = make_batch(
-            self._scans,
-            _scans_of(settings, plan.views),
-            plan.views,
-            plan.max_angle,
-            generator,
-            settings.augmentation,
-        )
-        frame = settings.network.translation_frame
-        return batch, make_targets(batch, settings.objective, generator, translation_frame=frame)
-
-
-def _scans_of(settings: TrainingSettings, views: int) -> int:
-    return max(1, settings.batch_images // views)
-
-
-def _max_angle(settings: TrainingSettings, images: int) -> float:
-    share = images / settings.images
-    return max((start, angle) for start, angle in settings.curriculum if start <= share)[1]
-
-
-BINS = ((0.0, 30.0), (30.0, 60.0), (60.0, 180.0))
-"""Degrees between the true orientations of two views, by which their accuracy is told."""
-ACCURACIES = (
-    "pair@15",
-    "pair@30",
-    "pair_median",
-    "identity@15",
-    *(f"pair@15_{low:g}-{high:g}" for low, high in BINS),
-)
-
-
-@torch.no_grad()
-def pair_accuracy(
-    network: RelPose, scans: Scans, *, views: int = 4, count: int = 32, level: int = 2
-) -> dict[str, float]:
-    """How often a pair's best rotation is right, for all pairs of scans drawn always alike.
-
-    The best on a grid where the network scores rotations, else what it regresses.
-
-    Quick, and without the solver: to watch a run, not to compare methods with.
-
-    Args:
-        network: To measure.
-        scans: Held out.
-        views: Views a scan, drawn from all of them.
-        count: Scans.
-        level: Of the rotation grid: 2 has cells of 16 degrees, 3 of 8.
-
-    Returns:
-        Fractions by the keys of `ACCURACIES`, and the median error in degrees.
-    """
-    device = network.device
-    training = network.training
-    network.eval()
-    generator = np.random.default_rng(0)
-    best_rotations = _regressed if network.preset.rotation == "regression" else _best_of_grid(network, level)
-    i, j = (index.tolist() for index in np.triu_indices(views, 1))
-    errors, angles = [], []
-    for _ in range(count):
-        batch = make_batch(scans, 1, views, 180.0, generator)
-        features = scene_features(network, _looks(batch, device), batch.crop_parameters.to(device))
-        best = best_rotations(network, features, i, j)
-        rotation = batch.camera_from_world[0, :, :, :3]
-        true = rotation[j] @ rotation[i].swapaxes(-1, -2)
-        errors.append(np.degrees(so3.angle_between(best, true)))
-        angles.append(np.degrees(so3.angle_between(true, np.eye(3))))
-    network.train(training)
-    error, angle = np.concatenate(errors), np.concatenate(angles)
-    figures = {
-        "pair@15": float((error <= 15).mean()),
-        "pair@30": float((error <= 30).mean()),
-        "pair_median": float(np.median(error)),
-        "identity@15": float((angle <= 15).mean()),
-    }
-    for low, high in BINS:
-        inside = (angle >= low) & (angle < high)
-        correct = float((error[inside] <= 15).mean()) if inside.any() else float("nan")
-        figures[f"pair@15_{low:g}-{high:g}"] = correct
-    return figures
-
-
-def _best_of_grid(network: RelPose, level: int) -> BestRotations:
-    rotations = np.array(so3_grid.grid(level))
-    embeddings = network.embed_relative(torch.from_numpy(rotations).float().to(network.device))
-
-    def best(network: RelPose, features: SceneFeatures, i: list[int], j: list[int]) -> FloatArray:
-        energies = network.pair_energies(network.pair_contexts(features, i, j), embeddings)[0]
-        return np.asarray(rotations[energies.argmax(-1).cpu().numpy()])
-
-    return best
-
-
-def _regressed(network: RelPose, features: SceneFeatures, i: list[int], j: list[int]) -> FloatArray:
-    rotations = network.optical_rotations(features)[0].double().cpu().numpy()
-    return np.asarray(rotations[j] @ rotations[i].swapaxes(-1, -2))
-
-
-def save_pieces(state: State, folder: Path, piece_bytes: int = PIECE_BYTES) -> None:
-    """Write a checkpoint as files of limited size; the listing, written last, makes it the current one."""
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    content = buffer.getvalue()
-    digest = hashlib.sha256(content).hexdigest()
-    names = []
-    for number, start in enumerate(range(0, len(content), piece_bytes)):
-        names.append(f"checkpoint-{digest[:12]}.{number:03d}")
-        (folder / names[-1]).write_bytes(content[start : start + piece_bytes])
-    listing = folder / "checkpoint.json"
-    partial = listing.with_suffix(".partial")
-    partial.write_text(json.dumps({"pieces": names, "sha256": digest}) + "\n", encoding="utf-8")
-    os.replace(partial, listing)  # noqa: PTH105 - a rename within one folder is all or nothing
-    for old in folder.glob("checkpoint-*.[0-9][0-9][0-9]"):
-        if old.name not in names:
-            old.unlink()
-
-
-def load_pieces(folder: Path) -> State:
-    """Read what `save_pieces` wrote.
-
-    Raises:
-        TrainingError: A piece is missing or damaged.
-    """
-    try:
-        listing = json.loads((folder / "checkpoint.json").read_text(encoding="utf-8"))
-        content = b"".join((folder / name).read_bytes() for name in listing["pieces"])
-    except (OSError, ValueError, KeyError) as err:
-        text = f"the checkpoint in {folder} cannot be read: {err}."
-        raise TrainingError(text) from err
-    if hashlib.sha256(content).hexdigest() != listing["sha256"]:
-        text = f"the checkpoint in {folder} is damaged: its pieces do not have the digest in checkpoint.json."
-        raise TrainingError(text)
-    state: State = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    return state
+    def _ask(self, _number: int, _frame: object) -> None:
+        self.asked = True
+        self.__exit__()
 
 
 def _own_device(device: str) -> torch.device:
-    own = torch.device(device)
+    try:
+        own = torch.device(device)
+    except RuntimeError as err:
+        text = f"{device!r} is no device to train on; name cpu, cuda, or one of several as cuda:1."
+        raise TrainingError(text) from err
     if own.type == "cuda" and own.index is None and "LOCAL_RANK" in os.environ:
         own = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
     return own
+
+
+def _require(device: torch.device) -> None:
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as err:
+        why = str(err).splitlines()[0].rstrip(".")
+        text = f"the device {device} cannot be used here: {why}. Name another, such as cpu."
+        raise TrainingError(text) from err
 
 
 def _join(device: torch.device) -> tuple[int, int]:
@@ -721,26 +492,6 @@ def _join(device: torch.device) -> tuple[int, int]:
     if processes > 1 and not distributed.is_initialized():
         distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
     return (distributed.get_rank(), processes) if processes > 1 else (0, 1)
-
-
-def _looks(batch: Batch, device: torch.device) -> Looks:
-    if isinstance(batch.looks, torch.Tensor):
-        return batch.looks.to(device)
-    return [None if each is None else each.to(device) for each in batch.looks]
-
-
-def _moved(targets: Targets, device: torch.device) -> Targets:
-    return replace(
-        targets,
-        true=targets.true.to(device),
-        uniform=targets.uniform.to(device),
-        near=targets.near.to(device),
-        log_density=targets.log_density.to(device),
-        rotations=targets.rotations.to(device),
-        translations=targets.translations.to(device),
-        places=None if targets.places is None else targets.places.to(device),
-        asked=None if targets.asked is None else targets.asked.to(device),
-    )
 
 
 def _cut_curve(path: Path, step: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import threading
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 
 from relpose_ros.captures.renderer import Renderer, RenderError
 from relpose_ros.captures.scans import PLACE_STRIDE, ScanRenderer
-from relpose_ros.captures.shards import ShardPlan, read_shard, write_shards
+from relpose_ros.captures.shards import Shard, ShardError, ShardPlan, write_shards
 from relpose_ros.network.crops import crop_parameters
 
 if TYPE_CHECKING:
@@ -84,7 +85,9 @@ def test_shards_are_continued_though_a_process_dies(scans: ScanRenderer, tmp_pat
     killer.join()
     assert (tmp_path / "00000/images.npy").stat().st_mtime_ns == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["00000", "00001"]
-    shard = read_shard(tmp_path / "00001")
+    with pytest.raises(ShardError, match="00000 was made with views 3, not 4: name another folder"):
+        write_shards(tmp_path, 2, replace(plan, views=4))
+    shard = Shard(tmp_path / "00001")
     for row in range(2):
         scan = scans.scan(2 + row, 3)
         assert np.array_equal(shard["images"][row], scan.images)

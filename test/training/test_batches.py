@@ -1,14 +1,17 @@
 """Batches: views within their angle, and augmentations under which a scan stays true to its poses."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from relpose_ros.captures.shards import ShardError, new_shard
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import look_at
 from relpose_ros.training import batches
-from relpose_ros.training.batches import Augmentation, Scans, ShardError
+from relpose_ros.training.batches import Augmentation, Scans
 
 seeds = st.integers(0, 2**32 - 1)
 SIZE, WIDTH, HEIGHT = 32, 64, 48
@@ -134,6 +137,18 @@ def test_a_batch_is_the_same_for_the_same_seed_and_another_for_another(fake_shar
     assert draw[0].looks.equal(draw[1].looks)
     assert (draw[0].camera_from_world == draw[1].camera_from_world).all()
     assert not draw[0].looks.equal(draw[2].looks)
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="open files are counted on Linux alone")
+def test_shards_on_disk_are_not_held_open(fake_shard, tmp_path):
+    for number in range(3):
+        with new_shard(tmp_path / str(number), {}) as arrays:
+            arrays |= fake_shard(2, 4, SIZE, number)
+    scans = batches.open_scans([tmp_path])
+    assert scans.views == 4
+    assert len(scans) == 6
+    assert str(tmp_path) not in Path("/proc/self/maps").read_text()
+    assert scans.row(5)["images"].shape == (4, SIZE, SIZE, 3)
 
 
 def test_rows_come_from_the_right_shard(fake_shard):

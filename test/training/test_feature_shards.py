@@ -9,16 +9,15 @@ import pytest
 import torch
 
 from relpose_ros import cli
-from relpose_ros.captures.shards import new_shard, read_shard
+from relpose_ros.captures.shards import Shard, ShardError, new_shard
 from relpose_ros.network.checkpoint import load_network, random_network, write_network
 from relpose_ros.network.efficientnet import EfficientNetLite0
 from relpose_ros.network.presets import PRESETS
 from relpose_ros.network.relpose import NetworkUseError
-from relpose_ros.training import trainer
+from relpose_ros.training import settings as training_settings
 from relpose_ros.training.batches import (
     Augmentation,
     Scans,
-    ShardError,
     augmented,
     make_batch,
     normalised,
@@ -27,14 +26,15 @@ from relpose_ros.training.batches import (
 from relpose_ros.training.feature_shards import write_feature_shards
 from relpose_ros.training.imagenet import imagenet_backbone
 from relpose_ros.training.objective import ObjectiveSettings, scene_features
-from relpose_ros.training.trainer import Trainer, TrainingError, TrainingSettings
+from relpose_ros.training.settings import TrainingError, TrainingSettings, initial_network, settings_for
+from relpose_ros.training.trainer import Trainer
 
 
 @pytest.fixture
 def shards(tmp_path, fake_shard):
     """A folder of two shards of images."""
     for number in range(2):
-        with new_shard(tmp_path / "shards" / f"{number:05d}") as arrays:
+        with new_shard(tmp_path / "shards" / f"{number:05d}", {}) as arrays:
             arrays |= fake_shard(3, 4, 32, number)
     return tmp_path / "shards"
 
@@ -68,6 +68,10 @@ def test_each_copy_is_changed_in_its_own_way_and_none_is_made_twice(shards, tiny
     (folder / "shards-00000-1" / "map_1.npy").unlink()
     write_feature_shards(folder, [shards], network, 2, augmentation=Augmentation())
     assert not (folder / "shards-00000-1" / "map_1.npy").exists()  # it stood already
+    with pytest.raises(ShardError, match="shards-00000-0 was made with seed 0, not 5"):
+        write_feature_shards(folder, [shards], network, 2, augmentation=Augmentation(), seed=5)
+    with pytest.raises(ShardError, match=r"shards-00000-0 was made with augmentation .*, not None"):
+        write_feature_shards(folder, [shards], network, 1)
     batch = make_batch(open_scans([folder / "shards-00000-0"]), 1, 2, 180.0, np.random.default_rng(0))
     rotations = batch.camera_from_world[0, :, :, :3]
     np.testing.assert_allclose(
@@ -109,7 +113,7 @@ def frozen(tiny_preset, monkeypatch):
     with torch.random.fork_rng():
         torch.manual_seed(1)
         public = EfficientNetLite0()
-    monkeypatch.setattr(trainer, "imagenet_backbone", lambda: public)
+    monkeypatch.setattr(training_settings, "imagenet_backbone", lambda: public)
     objective = ObjectiveSettings(uniform_rotations=16, near_rotations=8, match_weight=0.5, match_places=5)
     return TrainingSettings(
         preset="tiny", batch_images=8, max_views=3, precision="float32", objective=objective
@@ -118,10 +122,10 @@ def frozen(tiny_preset, monkeypatch):
 
 @torch.no_grad()
 def test_copies_are_what_the_changed_images_show(shards, frozen, tmp_path):
-    network = trainer.initial_network(frozen)
+    network = initial_network(frozen)
     write_feature_shards(tmp_path / "features", [shards], network, 1, augmentation=Augmentation(), seed=3)
     generator = np.random.default_rng(zlib.crc32(b"3 shards-00001-0"))
-    source, kept = read_shard(shards / "00001"), read_shard(tmp_path / "features" / "shards-00001-0")
+    source, kept = Shard(shards / "00001"), Shard(tmp_path / "features" / "shards-00001-0")
     sizes = set()
     for number in range(3):
         row = augmented({name: source[name][number] for name in source}, Augmentation(), generator)
@@ -137,8 +141,8 @@ def test_copies_are_what_the_changed_images_show(shards, frozen, tmp_path):
 
 
 def test_a_pretrained_backbone_stays_as_it_was(shards, frozen, tmp_path):
-    public = trainer.imagenet_backbone().state_dict()
-    write_feature_shards(tmp_path / "features", [shards], trainer.initial_network(frozen), 1)
+    public = training_settings.imagenet_backbone().state_dict()
+    write_feature_shards(tmp_path / "features", [shards], initial_network(frozen), 1)
     features = open_scans([tmp_path / "features"])
     run = Trainer(frozen, tmp_path / "run", features, open_scans([shards]))
     before = {name: value.clone() for name, value in run.network.state_dict().items()}
@@ -162,8 +166,8 @@ def test_a_pretrained_backbone_stays_as_it_was(shards, frozen, tmp_path):
 
 
 def test_a_pretrained_backbone_can_be_trained_from_its_first_map_on(shards, frozen, tmp_path):
-    public = trainer.imagenet_backbone().state_dict()
-    write_feature_shards(tmp_path / "features", [shards], trainer.initial_network(frozen), 1)
+    public = training_settings.imagenet_backbone().state_dict()
+    write_feature_shards(tmp_path / "features", [shards], initial_network(frozen), 1)
     features = open_scans([tmp_path / "features"])
     settings = replace(frozen, backbone_rate=0.25, warmup_images=0, decay=0.0)
     run = Trainer(settings, tmp_path / "run", features, features)
@@ -199,7 +203,7 @@ def test_a_pretrained_backbone_can_be_trained_from_its_first_map_on(shards, froz
 
 
 def test_the_command_trains_on_features_with_and_without_the_backbone(fake_shard, tmp_path):
-    with new_shard(tmp_path / "shards" / "00000") as arrays:
+    with new_shard(tmp_path / "shards" / "00000", {}) as arrays:
         arrays |= fake_shard(1, 8, 128, 0)
     features, public = tmp_path / "features", imagenet_backbone().state_dict()
     assert cli.main(["features", str(tmp_path / "shards"), "--output", str(features), "--plain"]) == 0
@@ -213,8 +217,8 @@ def test_the_command_trains_on_features_with_and_without_the_backbone(fake_shard
 
 
 def test_maps_behind_the_first_are_worked_out_where_they_are_missing(shards, frozen):
-    network = trainer.initial_network(frozen)
-    images = normalised(read_shard(shards / "00000")["images"][0])
+    network = initial_network(frozen)
+    images = normalised(Shard(shards / "00000")["images"][0])
     maps = network.feature_extractor.feature_extractor.stage_maps(images)
     with torch.no_grad():
         seen, given = network.look(images), network.summarise([None, maps[1]])
@@ -225,7 +229,7 @@ def test_maps_behind_the_first_are_worked_out_where_they_are_missing(shards, fro
 
 
 def test_where_a_backbone_was_trained_is_not_forgotten(shards, frozen, tiny_preset, tmp_path, monkeypatch):
-    write_feature_shards(tmp_path / "features", [shards], trainer.initial_network(frozen), 1)
+    write_feature_shards(tmp_path / "features", [shards], initial_network(frozen), 1)
     features = open_scans([tmp_path / "features"])
     settings = replace(frozen, backbone_rate=0.5)
     run = Trainer(settings, tmp_path / "run", features)
@@ -245,7 +249,7 @@ def test_where_a_backbone_was_trained_is_not_forgotten(shards, frozen, tiny_pres
 
 
 def test_features_of_another_backbone_are_refused(shards, frozen, tiny_preset, tmp_path, monkeypatch):
-    write_feature_shards(tmp_path / "features", [shards], trainer.initial_network(frozen), 1)
+    write_feature_shards(tmp_path / "features", [shards], initial_network(frozen), 1)
     features = open_scans([tmp_path / "features"])
     monkeypatch.setitem(PRESETS, "tiny", tiny_preset)
     with pytest.raises(TrainingError, match="features of another backbone than that of 'tiny'"):
@@ -260,5 +264,5 @@ def test_features_of_another_backbone_are_refused(shards, frozen, tiny_preset, t
 
 
 def test_compact_has_a_pretrained_backbone_and_the_paper_has_not():
-    assert trainer.settings_for("compact").pretrained_backbone
-    assert not trainer.settings_for("paper").pretrained_backbone
+    assert settings_for("compact").pretrained_backbone
+    assert not settings_for("paper").pretrained_backbone

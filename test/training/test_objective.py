@@ -17,7 +17,6 @@ from relpose_ros.network.presets import PRESETS, VARIANTS, named_preset
 from relpose_ros.network.relpose import RelPose
 from relpose_ros.training import objective
 from relpose_ros.training.objective import Batch, Objective, ObjectiveSettings
-from relpose_ros.training.trainer import _moved
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -206,7 +205,7 @@ def test_nothing_is_left_on_the_cpu_when_the_weights_are_elsewhere(name, variant
     monkeypatch.setattr(torch, "autocast", lambda device, enabled: nullcontext())  # which that device lacks
     meta = torch.device("meta")
     losses = Objective(network.to(meta), settings)(
-        images, torch.empty(2, 4, 3, device="meta"), _moved(targets, meta)
+        images, torch.empty(2, 4, 3, device="meta"), targets.to(meta)
     )
     losses[0].backward()
     assert losses.device == network.device == meta

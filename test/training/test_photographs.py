@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from relpose_ros.captures.folder import Frame, save_capture
-from relpose_ros.captures.shards import new_shard, read_shard
+from relpose_ros.captures.shards import Shard, ShardError, new_shard
 from relpose_ros.geometry import so3
 from relpose_ros.training.batches import FIELDS, Scans, open_scans
 from relpose_ros.training.photographs import (
@@ -43,9 +43,9 @@ def test_crops_show_the_box_with_jitter_and_poses_stay(capture, tiny_preset, tmp
     assert len(np.unique(shard["crop_parameters"][:, 0, :2], axis=0)) > 1
     again = capture_shard(capture, tiny_preset, 4, masked_copies=1, seed=1)
     np.testing.assert_array_equal(again["images"], shard["images"])
-    with new_shard(tmp_path / "shards" / "00000") as arrays:
+    with new_shard(tmp_path / "shards" / "00000", {}) as arrays:
         arrays |= shard
-    scans = Scans([read_shard(tmp_path / "shards" / "00000")])
+    scans = Scans([Shard(tmp_path / "shards" / "00000")])
     assert len(scans) == 4
     assert set(scans.row(3)) == {"images", *FIELDS}
 
@@ -62,13 +62,15 @@ def test_shards_of_many_captures_go_on_where_they_were_cut_off(capture, tiny_pre
     other = save_capture(tmp_path / "other", [Frame(capture.view(k), np.eye(3, 4)) for k in (0, 2)])
     (folder / "other.unfinished").mkdir(parents=True)
     assert write_capture_shards(folder, [capture], tiny_preset, 2, seed=1) == 1
-    first = read_shard(folder / "capture")
-    assert write_capture_shards(folder, [capture, other], tiny_preset, 2, seed=2) == 2
+    first = Shard(folder / "capture")
+    images = np.array(first["images"])
+    assert write_capture_shards(folder, [capture, other], tiny_preset, 2, seed=1) == 2
     assert {path.name for path in folder.iterdir()} == {"capture", "other"}
     assert len(open_scans([folder])) == 4
-    np.testing.assert_array_equal(read_shard(folder / "capture")["images"], first["images"])
-    with pytest.raises(CaptureShardError, match=r"capture has 2 copies of 32 pixels, not 3 of 32"):
-        write_capture_shards(folder, [capture], tiny_preset, 3)
+    np.testing.assert_array_equal(first["images"], images)
+    for asked, copies, seed in (("copies 2, not 3", 3, 1), ("seed 1, not 2", 2, 2)):
+        with pytest.raises(ShardError, match=f"capture was made with {asked}: name another folder"):
+            write_capture_shards(folder, [capture], tiny_preset, copies, seed=seed)
 
 
 def test_shards_that_cannot_be_made(capture, tiny_preset, tmp_path):
@@ -77,3 +79,6 @@ def test_shards_that_cannot_be_made(capture, tiny_preset, tmp_path):
             write_capture_shards(tmp_path / "a", [capture], tiny_preset, copies, masked_copies=masked)
     with pytest.raises(CaptureShardError, match="two captures are called capture"):
         write_capture_shards(tmp_path / "b", [capture, capture], tiny_preset, 1)
+    (tmp_path / "file").touch()
+    with pytest.raises(ShardError, match=r"file/capture cannot be written: Not a directory"):
+        write_capture_shards(tmp_path / "file", [capture], tiny_preset, 1)

@@ -3,6 +3,7 @@
 import csv
 import os
 import pickle
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,10 +14,12 @@ import torch
 
 from relpose_ros.network.checkpoint import load_network, random_network, read_metadata, write_network
 from relpose_ros.network.presets import PRESETS, VARIANTS, PresetError
-from relpose_ros.training import trainer
+from relpose_ros.training import checkpoints, trainer
 from relpose_ros.training.batches import Augmentation, Scans
 from relpose_ros.training.objective import ObjectiveSettings
-from relpose_ros.training.trainer import Trainer, TrainingError, TrainingSettings
+from relpose_ros.training.pair_accuracy import ACCURACIES, pair_accuracy
+from relpose_ros.training.settings import TrainingError, TrainingSettings, settings_for
+from relpose_ros.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("tiny_preset")
 
@@ -45,7 +48,7 @@ def test_a_resumed_run_ends_with_the_same_weights_and_curve(tmp_path, scans):
     whole.run(log_every=2, check_every=12, progress=False)
     assert whole.finished
     first = Trainer(SETTINGS, tmp_path / "halves", scans, scans)
-    first._out_of_time = lambda *_: first.step >= 9
+    first._ends = lambda *_: first.step >= 9
     first.run(log_every=2, check_every=12, progress=False)
     first.train_step()  # what comes after the checkpoint is lost
     second = Trainer(SETTINGS, tmp_path / "halves", scans, scans)
@@ -84,6 +87,51 @@ def test_time_that_is_up_leaves_a_checkpoint_and_weights(tmp_path, scans):
     assert Trainer(SETTINGS, tmp_path, scans).step == 0
     metadata = read_metadata(tmp_path / trainer.WEIGHTS)
     assert metadata["images_seen"] == "0"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_run_after_its_step_and_saves_it(tmp_path, scans, monkeypatch, number):
+    run = Trainer(SETTINGS, tmp_path, scans)
+    step = run.train_step
+
+    def interrupted():
+        if run.step == 2:
+            signal.raise_signal(number)
+        return step()
+
+    monkeypatch.setattr(run, "train_step", interrupted)
+    before = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt):
+        run.run(progress=False)
+    assert signal.getsignal(number) is before
+    assert Trainer(SETTINGS, tmp_path, scans).step == 3
+
+
+def test_a_second_signal_ends_a_run_at_once(tmp_path, scans, monkeypatch):
+    run = Trainer(SETTINGS, tmp_path, scans)
+
+    def impatient():
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(run, "train_step", impatient)
+    with pytest.raises(KeyboardInterrupt):
+        run.run(progress=False)
+    assert not (tmp_path / checkpoints.LISTING).exists()
+
+
+@pytest.mark.parametrize(
+    ("device", "match"), [("gpu", "'gpu' is no device to train on"), ("cuda:99", "the device cuda:99 cannot")]
+)
+def test_a_device_that_is_not_there_is_refused(tmp_path, scans, device, match):
+    with pytest.raises(TrainingError, match=match):
+        Trainer(SETTINGS, tmp_path, scans, device=device)
+
+
+def test_a_file_is_no_folder_of_a_run(tmp_path, scans):
+    (tmp_path / "file").touch()
+    with pytest.raises(TrainingError, match=r"file cannot be the folder of a run: File exists"):
+        Trainer(SETTINGS, tmp_path / "file", scans)
 
 
 def test_a_run_begins_with_the_weights_it_is_given_and_counts_on(tmp_path, scans):
@@ -140,7 +188,7 @@ def test_the_curve_of_a_run_without_a_checkpoint_begins_anew(tmp_path, scans):
     curve = tmp_path / "run" / trainer.CURVE
     curve.write_text("step,images\n2,16\n", encoding="utf-8")
     run = Trainer(SETTINGS, tmp_path / "run", scans)
-    run._out_of_time = lambda *_: run.step >= 2
+    run._ends = lambda *_: run.step >= 2
     run.run(log_every=2, progress=False)
     with curve.open() as stream:
         assert [row["step"] for row in csv.DictReader(stream)] == ["2"]
@@ -203,23 +251,23 @@ def test_the_learning_rate_rises_stays_and_falls(tmp_path, scans):
 
 def test_a_checkpoint_in_pieces_comes_back_whole_and_damage_is_noticed(tmp_path):
     state = {"numbers": torch.arange(1000), "step": 3}
-    trainer.save_pieces(state, tmp_path, piece_bytes=1000)
+    checkpoints.save_pieces(state, tmp_path, piece_bytes=1000)
     pieces = sorted(tmp_path.glob("checkpoint-*"))
     assert len(pieces) > 5
     assert max(piece.stat().st_size for piece in pieces) <= 1000
-    assert trainer.load_pieces(tmp_path)["numbers"].equal(state["numbers"])
-    trainer.save_pieces({"step": 4}, tmp_path, piece_bytes=1000)
-    assert trainer.load_pieces(tmp_path) == {"step": 4}
+    assert checkpoints.load_pieces(tmp_path)["numbers"].equal(state["numbers"])
+    checkpoints.save_pieces({"step": 4}, tmp_path, piece_bytes=1000)
+    assert checkpoints.load_pieces(tmp_path) == {"step": 4}
     assert not any(piece.exists() for piece in pieces)
     (piece, *_) = tmp_path.glob("checkpoint-*")
     damaged = bytearray(piece.read_bytes())
     damaged[len(damaged) // 2] ^= 1
     piece.write_bytes(damaged)
     with pytest.raises(TrainingError, match="damaged"):
-        trainer.load_pieces(tmp_path)
+        checkpoints.load_pieces(tmp_path)
     piece.unlink()
     with pytest.raises(TrainingError, match="cannot be read"):
-        trainer.load_pieces(tmp_path)
+        checkpoints.load_pieces(tmp_path)
 
 
 def test_a_checkpoint_of_another_network_is_refused(tmp_path, scans, tiny_preset, monkeypatch):
@@ -231,9 +279,9 @@ def test_a_checkpoint_of_another_network_is_refused(tmp_path, scans, tiny_preset
 
 def test_unknown_presets_and_variants_are_refused():
     with pytest.raises(PresetError, match="no preset 'large'; choose among paper, compact"):
-        trainer.settings_for("large")
+        settings_for("large")
     with pytest.raises(PresetError, match="no variant 'colour'; choose among no-index, pair-context"):
-        trainer.settings_for("compact", ["colour"])
+        settings_for("compact", ["colour"])
 
 
 @pytest.mark.parametrize("variants", [(), *((name,) for name in VARIANTS), ("regression", "first-camera")])
@@ -247,7 +295,7 @@ def test_every_variant_trains_is_measured_resumed_and_read_back(tmp_path, scans,
     assert run.finished
     assert weights(run.network).isfinite().all()
     assert not weights(run.network).equal(before)
-    assert set(run.measure(count=3)) == set(trainer.ACCURACIES)
+    assert set(run.measure(count=3)) == set(ACCURACIES)
     loaded = load_network(tmp_path / trainer.WEIGHTS)
     assert loaded.preset == settings.network
     assert weights(loaded).equal(weights(run.average))
@@ -257,16 +305,16 @@ def test_every_variant_trains_is_measured_resumed_and_read_back(tmp_path, scans,
 
 
 def test_a_variant_is_the_published_run_of_another_network():
-    plain, ablated = trainer.settings_for("compact"), trainer.settings_for("compact", ["regression"])
+    plain, ablated = settings_for("compact"), settings_for("compact", ["regression"])
     assert ablated.network.rotation == "regression"
     assert replace(ablated, variants=(), objective=plain.objective) == plain
-    assert trainer.settings_for("compact", ["no-index"]).objective == plain.objective
+    assert settings_for("compact", ["no-index"]).objective == plain.objective
 
 
 def test_pair_accuracy_of_a_network_that_knows_nothing_is_near_chance(tiny_preset, scans):
-    network = trainer.random_network(tiny_preset, 0)
-    figures = trainer.pair_accuracy(network, scans, views=3, count=10)
-    assert set(figures) == set(trainer.ACCURACIES)
+    network = random_network(tiny_preset, 0)
+    figures = pair_accuracy(network, scans, views=3, count=10)
+    assert set(figures) == set(ACCURACIES)
     assert figures["pair@30"] < 0.3
     assert 60 < figures["pair_median"] < 180
 
