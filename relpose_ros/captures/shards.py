@@ -32,6 +32,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -59,6 +60,8 @@ _UNFINISHED = ".unfinished"
 _LOG = logging.getLogger(__name__)
 _MAX_FRUITLESS = 3
 """So many times in a row all processes may die before a shard is whole."""
+_MAX_OPEN = 512
+"""Arrays, each with a file: half of what Linux distributions let a process have open."""
 
 
 class ShardError(RelPoseError):
@@ -198,7 +201,8 @@ def shard_folders(folders: Iterable[Path]) -> list[Path]:
 class Shard(Mapping[str, "npt.NDArray[Any]"]):
     """The arrays of one shard by name, each memory-mapped when it is asked for.
 
-    None is held open: with a shard of every sequence of CO3D there are more than a system opens at once.
+    The latest stay open, of all shards together, and no more: with a shard of every sequence of CO3D there
+    are more arrays than a system opens at once.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -210,8 +214,8 @@ class Shard(Mapping[str, "npt.NDArray[Any]"]):
         """An array, opened now."""
         if name not in self._names:
             raise KeyError(name)
-        array: npt.NDArray[Any] = np.load(self._folder / f"{name}.npy", mmap_mode="r")
-        return array
+        path = self._folder / f"{name}.npy"
+        return _mapped(path, path.stat().st_mtime_ns)
 
     def __iter__(self) -> Iterator[str]:
         """The names."""
@@ -220,6 +224,13 @@ class Shard(Mapping[str, "npt.NDArray[Any]"]):
     def __len__(self) -> int:
         """How many arrays."""
         return len(self._names)
+
+
+@lru_cache(maxsize=_MAX_OPEN)
+def _mapped(path: Path, _written_ns: int) -> npt.NDArray[Any]:
+    """An array of a file that was written at a time: another that takes its place is another."""
+    array: npt.NDArray[Any] = np.load(path, mmap_mode="r")
+    return array
 
 
 _renderers: dict[ShardPlan, ScanRenderer] = {}

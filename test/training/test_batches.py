@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from relpose_ros.captures import shards
 from relpose_ros.captures.shards import ShardError, new_shard
 from relpose_ros.geometry import so3
 from relpose_ros.geometry.cameras import look_at
@@ -140,15 +141,19 @@ def test_a_batch_is_the_same_for_the_same_seed_and_another_for_another(fake_shar
 
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="open files are counted on Linux alone")
-def test_shards_on_disk_are_not_held_open(fake_shard, tmp_path):
-    for number in range(3):
-        with new_shard(tmp_path / str(number), {}) as arrays:
-            arrays |= fake_shard(2, 4, SIZE, number)
+def test_more_shards_are_read_than_files_can_be_open(fake_shard, tmp_path):
+    shard = fake_shard(1, 2, 8, 0)
+    for number in range(150):
+        with new_shard(tmp_path / f"{number:03d}", {}) as arrays:
+            arrays |= shard | {"image_sizes": shard["image_sizes"] + number}
     scans = batches.open_scans([tmp_path])
-    assert scans.views == 4
-    assert len(scans) == 6
-    assert str(tmp_path) not in Path("/proc/self/maps").read_text()
-    assert scans.row(5)["images"].shape == (4, SIZE, SIZE, 3)
+    assert len(scans) == 150
+    assert scans.views == 2
+    for number in (*range(150), 0):
+        expected = shard["image_sizes"][0] + number
+        np.testing.assert_array_equal(scans.row(number)["image_sizes"], expected)
+    opened = Path("/proc/self/maps").read_text().count(str(tmp_path))
+    assert 0 < opened <= shards._MAX_OPEN < 150 * 5
 
 
 def test_rows_come_from_the_right_shard(fake_shard):
