@@ -10,6 +10,7 @@ import argparse
 import logging
 import os
 import sys
+from collections import Counter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -485,7 +486,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from relpose_ros.evaluation.protocol import evaluate, table, trust_table
 
     rows = evaluate(
-        [sequence for path in arguments.capture for sequence in _posed_views(path, arguments)],
+        _distinct([(path, each) for path in arguments.capture for each in _posed_views(path, arguments)]),
         arguments.views,
         arguments.weights,
         arguments.method,
@@ -533,6 +534,17 @@ def _posed_views(path: Path, arguments: argparse.Namespace) -> Iterator[PosedVie
         name = path.stem if len(objects) == 1 else f"{path.stem}/{object_id}"
         views, poses = [each.view for each in known], [each.camera_from_world for each in known]
         yield PosedViews.of_views(name, views, poses, masked=masked)
+
+
+def _distinct(found: Sequence[tuple[Path, PosedViews]]) -> list[PosedViews]:
+    """What was found at some places. Where two bear one name, their places stand in it too."""
+    from dataclasses import replace
+
+    names = Counter(each.name for _, each in found)
+    return [
+        each if names[each.name] == 1 else replace(each, name=f"{path.parent / path.stem}: {each.name}")
+        for path, each in found
+    ]
 
 
 def _render(arguments: argparse.Namespace) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -209,6 +210,24 @@ def test_a_capture_becomes_a_bag_an_estimate_and_a_row(tmp_path, posed_capture, 
         [next(r for r in of_capture if (r["method"], r["views"]) == ("identity", 3))[key] for key in whole],
         abs=1e-4,
     )
+
+
+def test_captures_of_one_name_are_told_apart(tmp_path, posed_capture):
+    for day in ("monday", "tuesday"):
+        shutil.copytree(posed_capture, tmp_path / day / "mug")
+    shutil.copytree(posed_capture, tmp_path / "bowl")
+    rows = tmp_path / "rows.json"
+    mugs = [str(tmp_path / day / "mug") for day in ("monday", "tuesday")]
+    command = ["evaluate", "--views", "2", "--method", "identity", "--output", str(rows)]
+    assert cli.main([*command, *mugs, str(tmp_path / "bowl")]) == 0
+    names = [row["capture"] for row in json.loads(rows.read_text())["rows"]]
+    assert names == [*(f"{mug}: mug" for mug in mugs), "bowl", "mean"]
+
+
+def test_a_capture_named_twice_is_refused(posed_capture, capsys):
+    capture = str(posed_capture)
+    assert cli.main(["evaluate", "--views", "2", "--method", "identity", capture, capture]) == 1
+    assert f"two captures are called {capture}: capture" in capsys.readouterr().err
 
 
 def test_weights_are_calibrated_on_captures_and_bags(tmp_path, posed_capture, random_weights, capsys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 import zlib
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -337,10 +338,10 @@ def evaluate(
         progress: Whether to show a progress bar on stderr.
 
     Raises:
-        EvaluationError: No captures, none of as many views or one whose cameras stand at one place, a number
-            of views outside 2 to 8, of orders below 1 or a seed below 0, a method that there is not (with
-            these weights), a file that holds no variant or one that was named before, or an output that
-            cannot be written.
+        EvaluationError: No captures, two of one name, none of as many views or one whose cameras stand at one
+            place, a number of views outside 2 to 8, of orders below 1 or a seed below 0, a method that there
+            is not (with these weights), a file that holds no variant or one that was named before, or an
+            output that cannot be written.
         NetworkFileError: Weights cannot be loaded.
     """
     from tqdm import tqdm
@@ -375,6 +376,9 @@ def evaluate(
 
 
 def _require_measurable(sequences: Sequence[PosedViews], least: int) -> None:
+    name, times = Counter(sequence.name for sequence in sequences).most_common(1)[0]
+    if times > 1:
+        raise EvaluationError(f"two captures are called {name}; rename one, or name it once.")
     most = max(len(sequence.camera_from_world) for sequence in sequences)
     if most < least:
         raise EvaluationError(f"no capture has {least} views with a pose, the most have {most}.")
