@@ -173,11 +173,16 @@ class Colmap:
                 device=colmap.Device.cpu,
             )
         colmap.match_exhaustive(database, device=colmap.Device.cpu)
-        # A calibrated lens is known better than a few views tell; refined, its eight numbers run away.
-        calibrated = any(view.distortion is not None for view in views)
+        # What is calibrated is known better than a few views tell; a refined lens's eight numbers run away.
+        lens_known = any(view.distortion is not None for view in views)
+        focal_known = all(view.intrinsics is not None for view in views)
         options = colmap.IncrementalPipelineOptions(
-            min_model_size=2, multiple_models=True, ba_refine_extra_params=not calibrated
+            min_model_size=2,
+            multiple_models=True,
+            ba_refine_extra_params=not lens_known,
+            ba_refine_focal_length=not focal_known,
         )
+        options.mapper.abs_pose_refine_focal_length = not focal_known
         models = colmap.incremental_mapping(database, images, folder / "models", options=options)
         if not models:
             return {}
