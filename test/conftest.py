@@ -17,6 +17,8 @@ from relpose_ros import cli
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from fisher_scenes import FisherScene
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 """Material that does not belong in the repository; a fresh clone elsewhere has none."""
 
@@ -86,3 +88,11 @@ def _write_category(root: Path, category: str, sequences: Sequence[str], *, fram
     for name, content in (("frame", annotations), ("sequence", listed)):
         with gzip.open(root / category / f"{name}_annotations.jgz", "wt") as stream:
             json.dump(content, stream)
+
+
+@pytest.fixture(scope="session")
+def fisher_scene_type() -> tuple[type[FisherScene], object]:
+    """Scenes of known energies, and cameras to put into them."""
+    import fisher_scenes
+
+    return fisher_scenes.FisherScene, fisher_scenes.around_object

@@ -9,15 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relpose_ros.evaluation import match_trust
+from relpose_ros.evaluation.calibration_fit import LEVELS, fit_calibration, measure_calibration, observe
 from relpose_ros.evaluation.match_trust import MatchedPairs, fit_trust, measure_trust
 from relpose_ros.evaluation.protocol import EvaluationError, view_orders
-from relpose_ros.inference.calibration import (
-    LEVELS,
-    Calibration,
-    fit_calibration,
-    measure_calibration,
-    observe,
-)
+from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.estimator import Estimator
 from relpose_ros.inference.outlines import find_outline
 from relpose_ros.inference.pair_energies import GridEmbeddings
@@ -29,9 +24,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from relpose_ros.evaluation.calibration_fit import CalibrationReport, Observation
     from relpose_ros.evaluation.match_trust import TrustReport
     from relpose_ros.evaluation.protocol import PosedViews
-    from relpose_ros.inference.calibration import CalibrationReport, Observation
     from relpose_ros.network.relpose import RelPose
 
 VIEWS = (3, 4, 5, 8)

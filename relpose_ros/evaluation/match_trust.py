@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from relpose_ros.evaluation.calibration_fit import expected_calibration_error
 from relpose_ros.geometry import so3
-from relpose_ros.inference.calibration import expected_calibration_error
 from relpose_ros.inference.local_features import find_features
 from relpose_ros.inference.matches import TRUST, trust_of_signs
 from relpose_ros.inference.side_by_side import side_by_side

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relpose_ros.estimates import Evidence, Verdict
-from relpose_ros.geometry import cameras, so3
-from relpose_ros.inference.calibration import (
+from relpose_ros.evaluation.calibration_fit import (
     LEVELS,
     coverage,
     expected_calibration_error,
     mahalanobis_square,
 )
+from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.outlines import find_outline, sightlines
 from relpose_ros.inference.uncertainty import WITHIN
 
