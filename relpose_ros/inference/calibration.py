@@ -58,13 +58,28 @@ class Calibration:
                 if known.get(several) is not None:
                     known[several] = tuple(float(number) for number in known[several])
             found = cls(**known)
-            numbers = [found.temperature, found.pair_spread, found.rotation_spread, *found.position_sigma]
-            sound = all(math.isfinite(number) and number > 0 for number in numbers) and 0 <= found.flat < 1
-            sound &= found.match_trust is None or (
-                len(found.match_trust) == 4 and all(map(math.isfinite, found.match_trust))
-            )
+            amiss = found._amiss()
         except (ValueError, TypeError, AttributeError) as err:
             raise CalibrationError(f"the calibration cannot be read: {err}; calibrate anew.") from err
-        if not sound or "temperature" not in known:
-            raise CalibrationError(f"the calibration makes no sense: {text[:200]}; calibrate anew.")
+        if "temperature" not in known:
+            amiss = "has no temperature"
+        if amiss:
+            raise CalibrationError(f"the calibration {amiss}; calibrate anew.")
         return found
+
+    def _amiss(self) -> str:
+        """What makes no sense of it; empty where all does."""
+        factors = {name: getattr(self, name) for name in ("temperature", "pair_spread", "rotation_spread")}
+        for name, value in factors.items():
+            if isinstance(value, bool) or not (math.isfinite(value) and value > 0):
+                return f"has a {name} of {value}, which is no positive number"
+        if len(self.position_sigma) != 2 or not all(math.isfinite(s) and s > 0 for s in self.position_sigma):
+            return f"has a position_sigma of {list(self.position_sigma)}, which are not two positive numbers"
+        if not isinstance(self.placed_by_boxes, bool):
+            return f"has placed_by_boxes {self.placed_by_boxes!r}, which is neither true nor false"
+        if isinstance(self.flat, bool) or not 0 <= self.flat < 1:
+            return f"has a flat share of {self.flat}, which does not lie from 0 to below 1"
+        trust = self.match_trust
+        if trust is not None and (len(trust) != 4 or not all(map(math.isfinite, trust))):
+            return f"has a match_trust of {list(trust)}, which are not four numbers"
+        return ""

@@ -48,7 +48,7 @@ from relpose_ros.inference.uncertainty import (
     pairs_of_unknown_trust,
 )
 from relpose_ros.inference.verdict import WITHOUT_PROBABILITIES, judge
-from relpose_ros.network.checkpoint import NetworkFileError, load_network, read_metadata
+from relpose_ros.network.checkpoint import SHIPPED_WEIGHTS, NetworkFileError, load_network, read_metadata
 from relpose_ros.network.crops import crop_square, crop_view
 from relpose_ros.network.features import ViewFeatures
 from relpose_ros.views import MAX_VIEWS, MIN_VIEWS
@@ -97,10 +97,10 @@ class _Found:
     energies: PairEnergies
     distributions: PairDistributions
     calibration: Calibration
-    """Of the sum of energies, which are log-densities as they are."""
+    """What still applies: the energies have their temperature and uniform share, so 1 and 0 of those."""
 
     @property
-    def tempered_energies(self) -> PairEnergies:
+    def weighted_energies(self) -> PairEnergies:
         """The energies as they add up over a scan.
 
         Every view takes part in N - 1 pairs, whose errors in the network's eyes go together. Those of matches
@@ -207,7 +207,7 @@ class Estimator:
         try:
             calibration = None if stored is None else Calibration.from_json(stored)
         except CalibrationError as err:
-            raise NetworkFileError(f"{path}: {err}") from err
+            raise NetworkFileError(f"{path or SHIPPED_WEIGHTS}: {err}") from err
         return cls(network, calibration, evidence)
 
     @property
@@ -222,8 +222,10 @@ class Estimator:
     def rest_on(self, evidence: EvidenceSettings) -> None:
         """Goes on with other evidence from the next estimate on."""
         with self._lock:
-            if evidence != self._evidence:
-                self._evidence, self._matcher = evidence, self._matcher_of(evidence)
+            # A matcher keeps the features of the views held, which take a third of a second a view to find.
+            if _of_matches(evidence) != _of_matches(self._evidence):
+                self._matcher = self._matcher_of(evidence)
+            self._evidence = evidence
 
     @torch.no_grad()
     def estimate(self, scan: Scan) -> ScanEstimate:
@@ -313,10 +315,10 @@ class Estimator:
         found = self._search(scan)
         known = found.distributions
         if len(scan.views) == 2 and self._calibration is not None:
-            # Two views have nothing to be joined to: where probabilities hold, the most of them counts, and
-            # not the highest density, which a narrow peak has that is hardly ever right.
+            # With one pair nothing can outvote a narrow peak, which is hardly ever right: where probabilities
+            # hold, the mode with the most of them counts, and not the highest density.
             known = heaviest_modes(known)
-        solution = solve(found.tempered_energies, known).rotations[0]
+        solution = solve(found.weighted_energies, known).rotations[0]
         translations = self._translations(found, solution.numpy())
         covariances = camera_covariances(
             *(found.distributions, found.energies, solution, translations, found.calibration),
@@ -385,7 +387,7 @@ class Estimator:
 
     def _translations(self, found: _Found, rotations: FloatArray) -> FloatArray:
         """Where the cameras stand from the object before matches tell more. -> (N, 3)."""
-        if found.calibration.placed_by_boxes:
+        if found.calibration.placed_by_boxes or not self._evidence.learned:
             return sighted_translations(found.outlines)
         predicted = predicted_translations(self._network, found.features, rotations)
         return about_the_object(rotations, predicted, found.outlines)
@@ -428,8 +430,9 @@ class Estimator:
         if refined is None:
             return None
         both = torch.from_numpy(np.stack([rotations, refined.rotations]))
-        before, after = joint_scores(found.energies, both).tolist()
-        return None if after < before - LARGEST_LOSS * found.energies.count else refined
+        energies = found.weighted_energies
+        before, after = joint_scores(energies, both).tolist()
+        return None if after < before - LARGEST_LOSS * energies.count else refined
 
     def _features(self, scan: Scan) -> SceneFeatures:
         looks = self._looked_at(scan.views)
@@ -471,6 +474,11 @@ class Estimator:
         if alone:
             return None
         return Matcher(surroundings=evidence.surroundings, learned_trust=self._match_trust)
+
+
+def _of_matches(evidence: EvidenceSettings) -> tuple[bool, bool, bool]:
+    """What matches depend on."""
+    return evidence.use == "network", evidence.surroundings, evidence.learned
 
 
 def _outlines(scan: Scan) -> list[Outline | None]:

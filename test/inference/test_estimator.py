@@ -16,7 +16,8 @@ from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference import bundle_adjustment, matches
 from relpose_ros.inference.bundle_adjustment import Refined
 from relpose_ros.inference.calibration import Calibration
-from relpose_ros.inference.estimator import OWN_THREADS, Estimator, EvidenceSettings, ScanError
+from relpose_ros.inference.estimator import OWN_THREADS, Estimator, ScanError
+from relpose_ros.inference.evidence import EvidenceError, EvidenceSettings
 from relpose_ros.inference.outlines import find_outline, sighted_translations
 from relpose_ros.inference.predictions import about_the_object, predicted_translations, regressed_poses
 from relpose_ros.network.checkpoint import NetworkFileError, random_network, write_network
@@ -198,7 +199,7 @@ def test_threads_do_not_mix_scans(network):
 def test_weights_with_a_broken_calibration_are_refused(network, tmp_path):
     file = tmp_path / "broken.safetensors"
     write_network(network, file, {"calibration": "[]"})
-    with pytest.raises(NetworkFileError, match=r"broken.safetensors: the calibration makes no sense"):
+    with pytest.raises(NetworkFileError, match=r"broken.safetensors: the calibration has no temp"):
         Estimator.from_weights(file)
 
 
@@ -418,7 +419,7 @@ def test_a_refinement_that_contradicts_the_pairs_is_not_taken(network, ball, of_
 
 
 def test_geometry_alone(network, ball, of_ball, ball_errors):
-    """The network's rotations are silent: other weights, the same rotations."""
+    """The network says nothing: other weights, the same rotations and positions."""
     alone = of_ball(use="pairs", learned=False)
     assert [pair.evidence for pair in alone.pairs] == [Evidence.GEOMETRIC] * 3
     assert ball_errors(alone).max() < 1.5
@@ -426,6 +427,7 @@ def test_geometry_alone(network, ball, of_ball, ball_errors):
     assert [pair.entropy for pair in other.pairs] == pytest.approx([pair.entropy for pair in alone.pairs])
     for a, b in zip(alone.cameras, other.cameras, strict=True):
         assert math.degrees(so3.angle_between(a.object_from_camera, b.object_from_camera)) < 0.1
+        np.testing.assert_allclose(a.position, b.position, atol=2e-3)
     nothing = estimated(network, scan(0, 1), use="network", learned=False)
     assert nothing.pairs[0].evidence == Evidence(0)
     assert nothing.pairs[0].entropy == pytest.approx(0, abs=1e-6)
@@ -476,6 +478,40 @@ def test_other_evidence_from_the_next_estimate_on(network, ball, of_ball):
     ):
         changing.rest_on(EvidenceSettings(**chosen))
         assert numbers(changing.estimate(ball)) == numbers(of_ball(**chosen)), chosen
+
+
+def test_other_evidence_keeps_the_matches_that_it_does_not_change(network, ball, monkeypatch):
+    looked = []
+    find = matches.find_features
+
+    def counted(view, *rest, **options):
+        looked.append(view)
+        return find(view, *rest, **options)
+
+    monkeypatch.setattr(matches, "find_features", counted)
+    changing = Estimator(network, CALIBRATED, EvidenceSettings("pairs"))
+    changing.estimate(ball)
+    for settings, found in (
+        (EvidenceSettings("refine"), 3),
+        (EvidenceSettings("refine", first_view_distance=0.5), 3),
+        (EvidenceSettings("refine", surroundings=True), 6),
+    ):
+        changing.rest_on(settings)
+        changing.estimate(ball)
+        assert len(looked) == found, settings
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        ({"use": "netwrok"}, "evidence is 'netwrok'; choose among network, pairs, refine"),
+        ({"first_view_distance": -1.0}, "first_view_distance is -1.0 m"),
+        ({"first_view_distance": math.nan}, "first_view_distance is nan m"),
+    ],
+)
+def test_evidence_that_there_is_not(settings, match):
+    with pytest.raises(EvidenceError, match=match):
+        EvidenceSettings(**settings)
 
 
 @pytest.mark.parametrize("use", ["network", "refine"])
