@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -54,6 +55,16 @@ class TrainingSettings:
     objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
     augmentation: Augmentation = field(default_factory=Augmentation)
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse a rate that would climb the loss.
+
+        Raises:
+            TrainingError: The backbone's rate is negative or no number.
+        """
+        if not 0 <= self.backbone_rate < math.inf:
+            text = f"the backbone's rate is {self.backbone_rate}; give 0 to leave it as it is, or more."
+            raise TrainingError(text)
 
     @property
     def network(self) -> Preset:

@@ -190,17 +190,16 @@ class Trainer:
                 self.train_step()
                 bar.update(self.images - was)
                 self._seconds = before + time.monotonic() - started
-                check = self.step % check_every == 0
+                check = self.step % check_every == 0 or self.finished
                 if self.step % log_every == 0 or check:
                     means = torch.stack(self._unlogged).mean(0).tolist()
                     self._unlogged.clear()
-                    now = time.monotonic()
-                    speed = (self.images - last[0]) / (now - last[1])
-                    last = (self.images, now)
+                    speed = (self.images - last[0]) / (time.monotonic() - last[1])
                     bar.set_postfix_str(f"rotation {means[1]:.2f}, {speed:.0f} images/s")
                     if check:
                         self.save()  # a measurement that fails must not take the steps with it
                     self._log(means, speed, self.measure() if check else {})
+                    last = (self.images, time.monotonic())
             self.save()
         if stop.asked:
             _LOG.info("stopped at step %d; the same command goes on.", self.step)
@@ -236,7 +235,7 @@ class Trainer:
         """Of the coming step: a linear rise, a plateau, a linear fall to 0."""
         s = self.settings
         rise = min(1.0, (self.images - (self._began or 0) + s.batch_images) / max(s.warmup_images, 1))
-        left = 1 - self.images / s.images
+        left = max(0.0, 1 - self.images / s.images)
         return s.learning_rate * rise * (min(1.0, left / s.decay) if s.decay > 0 else 1.0)
 
     def max_angle(self) -> float:
@@ -331,7 +330,7 @@ class Trainer:
         self.images = self._began = int(read_metadata(weights).get("images_seen", "0"))
         if self.finished:
             asked = self.settings.images
-            text = f"{weights} has seen {self.images} images, all in all {asked} are asked for: ask for more."
+            text = f"{weights} has seen {self.images} images, all in all {asked} are asked for (--images)."
             raise TrainingError(text)
 
     def _require_same_start(self) -> None:
@@ -436,7 +435,7 @@ class Trainer:
             **{name: round(value, 4) for name, value in accuracy.items()},
         }
         columns = [*_COLUMNS, *_LOSSES, *ACCURACIES]
-        new = not path.exists()
+        new = not path.exists() or path.stat().st_size == 0
         with path.open("a", newline="", encoding="utf-8") as stream:
             writer = csv.DictWriter(stream, columns)
             if new:
@@ -498,6 +497,6 @@ def _cut_curve(path: Path, step: int) -> None:
     """Forget what was logged after the checkpoint: those steps are taken again."""
     if path.exists():
         with path.open(newline="", encoding="utf-8") as stream:
-            header, *rows = list(csv.reader(stream))
+            rows = list(csv.reader(stream))
         with path.open("w", newline="", encoding="utf-8") as stream:
-            csv.writer(stream).writerows([header, *(row for row in rows if int(row[0]) <= step)])
+            csv.writer(stream).writerows([*rows[:1], *(row for row in rows[1:] if int(row[0]) <= step)])

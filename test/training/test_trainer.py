@@ -65,7 +65,9 @@ def test_a_resumed_run_ends_with_the_same_weights_and_curve(tmp_path, scans):
     for step, row in rows("halves").items():
         for column in ("images", "loss", "learning_rate", "pair@30"):
             assert row[column] == rows("whole")[step][column]
-    assert int(step) == whole.step - whole.step % 2
+    assert int(step) == whole.step
+    assert rows("whole")[step]["pair@30"]  # of the weights that the run ends with
+    assert float(rows("whole")[step]["learning_rate"]) == 0
 
 
 def test_a_forward_pass_in_half_precision_learns_the_same(tmp_path, scans):
@@ -126,6 +128,22 @@ def test_a_second_signal_ends_a_run_at_once(tmp_path, scans, monkeypatch):
 def test_a_device_that_is_not_there_is_refused(tmp_path, scans, device, match):
     with pytest.raises(TrainingError, match=match):
         Trainer(SETTINGS, tmp_path, scans, device=device)
+
+
+def test_a_backbone_that_would_climb_is_refused():
+    for rate in (-0.3, float("nan"), float("inf")):
+        with pytest.raises(TrainingError, match=f"the backbone's rate is {rate}"):
+            replace(SETTINGS, backbone_rate=rate)
+
+
+def test_a_curve_that_was_emptied_goes_on(tmp_path, scans):
+    run = Trainer(SETTINGS, tmp_path, scans)
+    run._ends = lambda *_: run.step >= 2
+    run.run(log_every=2, progress=False)
+    (tmp_path / trainer.CURVE).write_text("", encoding="utf-8")
+    Trainer(SETTINGS, tmp_path, scans).run(log_every=4, progress=False)
+    with (tmp_path / trainer.CURVE).open() as stream:
+        assert next(csv.DictReader(stream))["step"] == "4"
 
 
 def test_a_file_is_no_folder_of_a_run(tmp_path, scans):
