@@ -30,11 +30,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AscentSettings:
-    """How the joint maximum is looked for. Numbers of solutions are for a full scan; see `many`."""
+    """How the joint maximum is looked for.
+
+    Numbers of solutions, places, rounds and turns are for a full scan: smaller ones, which are cheap, have
+    more, see `many`.
+    """
 
     full_scan: int = 28
     """Pairs that those numbers are meant for, 8 views."""
     most: int = 32
+    """What `many` gives at most."""
     beam: int = 8
     """Partial solutions kept while cameras join."""
     screened: int = 5
@@ -69,13 +74,13 @@ class AscentSettings:
     finalists: int = 2
     """Solutions that are refined."""
     turns: float = 0.2
-    """Times that they are, each time in other directions, at least once."""
+    """Times that they are refined, each time in other directions, at least once."""
     radii: tuple[float, ...] = tuple(math.radians(a) for a in (12, 6, 3))
     """Neighbourhood of each sweep over their cameras, rad."""
-    winners: int = 2
-    """Solutions that are polished at the end, and"""
-    polishes: int = 2
-    """how many times at most; both are one for a full scan."""
+    most_winners: int = 2
+    """Solutions that are polished at the end: one of a full scan, of smaller ones at most so many."""
+    most_polishes: int = 2
+    """Times that these are polished, likewise."""
     settled: float = 1e-4
     """Nats: where a polish gains less, another one would gain no more."""
     last_radii: tuple[float, ...] = tuple(math.radians(a) for a in (8, 4, 2, 1, 0.5, 0.2, 0.08))
@@ -147,7 +152,8 @@ def solve(
         # All may end on one hill: where they started is kept beside, for a runner-up to be told.
         found, scores = _best(energies, torch.cat([best, found]), count, settings.distinct)
     last, polishes = (
-        min(most, settings.many(1, energies.count)) for most in (settings.winners, settings.polishes)
+        min(most, settings.many(1, energies.count))
+        for most in (settings.most_winners, settings.most_polishes)
     )
     winners, scores = found[:last], scores[:last]
     for turn in range(polishes):

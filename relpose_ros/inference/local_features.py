@@ -37,7 +37,8 @@ MOST_FEATURES = 2500
 MOST_SQUEEZED = 1200
 """Of the squeezed picture: more match hardly more, and matching costs the most."""
 LEAST_SHARE = 0.1
-"""Of a picture that a mask is taken to fill: SIFT's time grows as that falls."""
+"""Of a picture, the least that a mask is taken to fill: SIFT is asked for as many more features as the mask
+fills less, and its time grows with them."""
 LONGEST_SIDE = 640
 """Pixels: a larger part of an image is shrunk to it. Finer features add time and hardly any matches."""
 LARGEST_SCALE = 1.5

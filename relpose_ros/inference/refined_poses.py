@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     IntArray = npt.NDArray[np.int64]
 
 SIGHTLINES_APART = 0.1
-"""How far from the others' common point cameras may look that nobody could refine, in the estimate's unit:
-the middle of a box is not the same point of the object from all sides."""
+"""Standard deviation, in the estimate's unit, of how far the lines of sight of cameras that the adjustment
+left out pass from the point where the others' meet: the middle of a box is not the same point of the object
+from all sides."""
 STEP = 1e-6
 """Of the numeric derivative of the frame by the poses."""
 

@@ -278,11 +278,11 @@ def _least_moment(distributions: PairDistributions) -> FloatArray:
 def _about(
     distributions: PairDistributions, energies: PairEnergies, relative: torch.Tensor, masses: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The masses (P, L) that tell how exactly pairs hold the poses (P, 3, 3) they are right about.
+    """The masses (P, L) of which each pair's covariance about the final relative pose (P, 3, 3) is taken.
 
-    Few chances of a gross error, far away, would be most of a second moment. Where matches agree with the
-    poses that chance is told apart, as a probability, and only the mass around the poses counts. Which pairs
-    those are comes second, (P,).
+    A small chance of a gross error, far away, would be most of a second moment. Where a pair's matches agree
+    with the final poses that chance is told apart, as a probability, and only the mass within `BASIN` of them
+    counts. Which pairs those are comes second, (P,).
     """
     if energies.evidence is None:
         return masses, torch.zeros(energies.count, dtype=torch.bool)

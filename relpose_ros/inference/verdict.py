@@ -51,6 +51,9 @@ GUESSED = (
 )
 """What is missing where no view said how it was taken, in words."""
 
+UNCALIBRATED = "these weights are not calibrated, so that none of their estimates can be called enough"
+"""What is missing where nobody knows how far probabilities hold, in words."""
+
 WITHOUT_PROBABILITIES = (
     f"{NOT_ENOUGH}this network regresses poses and cannot say how far to trust them, so that none of its "
     "estimates can be called enough"
@@ -85,49 +88,35 @@ def judge(
             that only pans or rolls has not left its place.
     """
     deviations = rotation_deviations(covariances)
+    worst = f"about {math.degrees(deviations.max()):.0f} degrees"
     seen = np.tile(AHEAD, (len(covariances), 1)) if seen is None else seen
-    tied = _tied(pairs, len(covariances))
     trusted = [p for p, pair in enumerate(pairs) if pair.solution_probability >= TRUSTED_PROBABILITY]
-    if all(tied) and (unchecked := _unchecked(pairs, trusted, seen)) is not None:
+    if loose := _loose(pairs, len(covariances)):
+        weakest = _weak_link(pairs, loose, len(covariances))
+        return Verdict.ONE_MORE_VIEW, weakest, f"{ONE_MORE}{_weakness(pairs[weakest])}"
+    if (unchecked := _unchecked(pairs, trusted, seen)) is not None:
         bridge, views = unchecked
         hangs = f"view {views[0]} hangs" if len(views) == 1 else f"views {_listed(views)} hang"
-        pair = pairs[bridge]
-        reason = f"{hangs} on pair {pair.i}-{pair.j} alone, which no other pair checks"
+        reason = f"{hangs} on {_name(pairs[bridge])} alone, which no other pair checks"
         return Verdict.ONE_MORE_VIEW, bridge, f"{ONE_MORE}{reason}"
     against = [p for p, pair in enumerate(pairs) if _contradicts(pair)]
-    if all(tied) and len(against) > MOST_CONTRADICTING * len(trusted):
+    if len(against) > MOST_CONTRADICTING * len(trusted):
         surest = max(against, key=lambda p: pairs[p].probability_within_15_deg)
-        reason = (
+        agree = (
             f"{len(trusted)} of {len(pairs)} pairs agree, but {len(against)} are as sure of something else"
         )
-        return Verdict.ONE_MORE_VIEW, surest, f"{ONE_MORE}{reason}: {_weakness(pairs[surest])}"
-    if all(tied) and deviations.max() <= LARGEST_ROTATION_DEVIATION:
-        weakest = min(range(len(pairs)), key=lambda p: _certainty(pairs[p]))
-        if guessed and any(Evidence.GEOMETRIC in pairs[p].evidence for p in trusted):
-            return Verdict.ONE_MORE_VIEW, weakest, f"{NOT_ENOUGH}{GUESSED}"
-        if calibrated:
-            worst = math.degrees(deviations.max())
-            return (
-                Verdict.ENOUGH,
-                weakest,
-                f"enough: {len(trusted)} of {len(pairs)} pairs agree, rotations to about {worst:.0f} degrees",
-            )
-        reason = "these weights are not calibrated, so that none of their estimates can be called enough"
-        return Verdict.ONE_MORE_VIEW, weakest, f"{NOT_ENOUGH}{reason}"
-    loose = [camera for camera, is_tied in enumerate(tied) if not is_tied] or [int(deviations.argmax())]
-    # Not the pair that knows least, which may be of two views that show opposite sides: the weak link of the
-    # best chain is what a further view between the two would mend.
-    chains = _chains(pairs, len(covariances))
-    blocking = [p for camera in loose for p in chains[camera]] or list(range(len(pairs)))
-    weakest = min(blocking, key=lambda p: _certainty(pairs[p]))
-    reason = _weakness(pairs[weakest])
-    if all(tied):
-        worst = math.degrees(deviations.max())
-        pair = pairs[weakest]
-        reason = (
-            f"rotations are known to about {worst:.0f} degrees only, the weak link is pair {pair.i}-{pair.j}"
-        )
-    return Verdict.ONE_MORE_VIEW, weakest, f"{ONE_MORE}{reason}"
+        return Verdict.ONE_MORE_VIEW, surest, f"{ONE_MORE}{agree}: {_weakness(pairs[surest])}"
+    if deviations.max() > LARGEST_ROTATION_DEVIATION:
+        weakest = _weak_link(pairs, [int(deviations.argmax())], len(covariances))
+        reason = f"rotations are known to {worst} only, the weak link is {_name(pairs[weakest])}"
+        return Verdict.ONE_MORE_VIEW, weakest, f"{ONE_MORE}{reason}"
+    weakest = min(range(len(pairs)), key=lambda p: _certainty(pairs[p]))
+    if guessed and any(Evidence.GEOMETRIC in pairs[p].evidence for p in trusted):
+        return Verdict.ONE_MORE_VIEW, weakest, f"{NOT_ENOUGH}{GUESSED}"
+    if not calibrated:
+        return Verdict.ONE_MORE_VIEW, weakest, f"{NOT_ENOUGH}{UNCALIBRATED}"
+    agree = f"{len(trusted)} of {len(pairs)} pairs agree, rotations to {worst}"
+    return Verdict.ENOUGH, weakest, f"enough: {agree}"
 
 
 def rotation_deviations(covariances: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -151,13 +140,17 @@ def _certainty(pair: PairRotation) -> float:
 
 
 def _contradicts(pair: PairRotation) -> bool:
-    """Whether a pair would be trusted if it agreed with the final poses."""
+    """Whether a pair is sure of a rotation which is not that of the final poses."""
     sure = pair.probability_within_15_deg >= TRUSTED_PROBABILITY
     return sure and pair.solution_probability < CONTRADICTED
 
 
+def _name(pair: PairRotation) -> str:
+    return f"pair {pair.i}-{pair.j}"
+
+
 def _weakness(pair: PairRotation) -> str:
-    name = f"pair {pair.i}-{pair.j}"
+    name = _name(pair)
     if pair.ambiguous:
         return f"{name} is ambiguous by about {10 * round(math.degrees(pair.ambiguity_angle) / 10)} degrees"
     if pair.probability_within_15_deg >= TRUSTED_PROBABILITY and pair.solution_angle < CONTRADICTION_ANGLE:
@@ -168,6 +161,17 @@ def _weakness(pair: PairRotation) -> str:
     if chance < HARDLY_ANYTHING:
         return f"{name} says hardly anything of its rotation"
     return f"{name} knows its rotation to 15 degrees with {chance:.0f}% only"
+
+
+def _weak_link(pairs: Sequence[PairRotation], cameras: Sequence[int], views: int) -> int:
+    """The pair that keeps cameras from being known.
+
+    Not the one that knows least, which may be of two views that show opposite sides: the weak link of the
+    best chain is what a further view between the two would mend.
+    """
+    chains = _chains(pairs, views)
+    blocking = [p for camera in cameras for p in chains[camera]] or list(range(len(pairs)))
+    return min(blocking, key=lambda p: _certainty(pairs[p]))
 
 
 def _chains(pairs: Sequence[PairRotation], views: int) -> list[list[int]]:
@@ -224,11 +228,11 @@ def _listed(views: Sequence[int]) -> str:
     return f"{', '.join(map(str, views[:-1]))} and {views[-1]}"
 
 
-def _tied(pairs: Sequence[PairRotation], views: int) -> list[bool]:
-    """Which cameras a chain of pairs ties to the first whose probabilities multiply to what is trusted."""
+def _loose(pairs: Sequence[PairRotation], views: int) -> list[int]:
+    """Cameras that no chain of pairs ties to the first whose probabilities multiply to what is trusted."""
     reached = [1.0, *[0.0] * (views - 1)]
     for _ in range(views - 1):
         for pair in pairs:
             reached[pair.i] = max(reached[pair.i], reached[pair.j] * pair.solution_probability)
             reached[pair.j] = max(reached[pair.j], reached[pair.i] * pair.solution_probability)
-    return [chance >= TRUSTED_PROBABILITY for chance in reached]
+    return [camera for camera, chance in enumerate(reached) if chance < TRUSTED_PROBABILITY]

@@ -321,7 +321,7 @@ def _stored_preset(metadata: Mapping[str, str], file: Path) -> Preset | None:
 
 
 def _guessed_preset(tensors: Tensors, file: Path) -> Preset:
-    """The known preset that has most of the file's names: a released checkpoint does not say."""
+    """The known preset of whose names the file has the largest share: a released checkpoint does not say."""
     shared = {preset.name: len(_expected(preset).keys() & tensors.keys()) for preset in PRESETS.values()}
     best = max(shared, key=lambda name: (shared[name] / len(_expected(PRESETS[name])), name))
     if shared[best] < len(tensors) / 4:
@@ -369,7 +369,7 @@ def _checked(tensors: Tensors, preset: Preset, file: Path) -> Tensors:
         for name, like in expected.items()
         if name in tensors and not _can_stand_for(tensors[name], like)
     ]:
-        complaints.append(f"it has as no plain numbers {_listed(mistyped)}")
+        complaints.append(f"it has as anything but plain fractions {_listed(mistyped)}")
     if not complaints and (
         broken := [name for name, tensor in tensors.items() if not tensor.float().sum().isfinite()]
     ):

@@ -80,7 +80,7 @@ class Preset:
             value = getattr(self, field)
             if get_origin(kind) is Literal and value not in get_args(kind):
                 known = ", ".join(get_args(kind))
-                raise PresetError(f"There is no {field} '{value}' of networks; there are {known}.")
+                raise PresetError(f"A network's {field} is {value!r}; it must be one of {known}.")
         if self.rotation == "regression" and self.correlation is not None:
             text = "A network that regresses rotations looks at no pairs: its correlation must be None."
             raise PresetError(text)

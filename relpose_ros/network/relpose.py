@@ -2,9 +2,9 @@
 
 The order of use: `RelPose.look` once per view, `RelPose.relate` once per scan, `RelPose.pair_contexts` once
 per pair, then `RelPose.pair_energies` for as many rotations as one likes. All of them take leading batch
-dimensions and gradients; a solver takes `RelPose.energy_head` for the last. `backbone_features`, `encode`,
-`energies` and `translations` speak the released network's convention (see `relpose_ros.network.conventions`);
-`embed_relative`, `energy_head`, `optical_translations` and `optical_rotations` speak ours.
+dimensions and gradients; a solver takes `RelPose.energy_head` for the last. `energies` and `translations`
+speak the released network's convention (see `relpose_ros.network.conventions`); `embed_relative`,
+`energy_head`, `optical_translations` and `optical_rotations` speak ours.
 """
 
 from __future__ import annotations

@@ -537,8 +537,9 @@ def _camera_info_of(bag: BagReader, image_topic: str, topics: dict[str, str]) ->
     infos = [topic for topic, kind in topics.items() if kind == CAMERA_INFO]
     if len(infos) == 1:
         return infos[0]
+    others = f", and of the others ({', '.join(infos)}) nobody knows whose they are" if infos else ""
     text = (
-        f"{bag.path} has no camera info {beside} beside {image_topic}, so nothing says where the "
+        f"{bag.path} has no camera info {beside} beside {image_topic}{others}: nothing says where the "
         "object's box is; record it too (its roi is the box, an empty one the whole image), or ObjectView."
     )
     raise BagError(text)

@@ -15,14 +15,13 @@ from relpose_ros.replay.bags import POSE_STAMPED, BagError, BagReader, choose_in
 from relpose_ros.replay.comparison import TruePose
 from relpose_ros.scanning.incoming import (
     QUATERNION_TOLERANCE,
-    Arrival,
-    Pairing,
     ViewError,
     object_id_of,
     source_of,
     view_from_image,
     view_from_object_view,
 )
+from relpose_ros.scanning.pairing import Arrival, Pairing
 from relpose_ros.scanning.settings import ScanSettings
 
 if TYPE_CHECKING:

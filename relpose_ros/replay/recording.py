@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from relpose_ros.estimates import Verdict
-from relpose_ros.views import Intrinsics, Scan
+from relpose_ros.inference.outlines import known_rays, rays_of
+from relpose_ros.views import Scan
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -114,13 +115,14 @@ def _record(view: View) -> ViewRecord:
     # Whole pixels, so that a cut without interpolation shows exactly what the corners' rays enclose.
     first = np.floor(centre - side / 2).astype(int)
     last = np.ceil(centre + side / 2).astype(int)
-    camera = view.intrinsics or Intrinsics.guessed(view.full_width, view.full_height)
-    focal, principal = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     corners = np.array([[first[0], first[1]], [last[0], first[1]], [last[0], last[1]], [first[0], last[1]]])
+    rays = rays_of(view, corners.astype(float))
+    if not known_rays(rays).all():  # beyond what the lens shows: as if it bent nothing
+        rays = rays_of(replace(view, distortion=None), corners.astype(float))
     return ViewRecord(
         view=replace(view, image=np.empty((0, 0, 3), np.uint8), mask=None),
         picture=_picture(view.image, first - np.array(view.origin), last - np.array(view.origin)),
-        corners=(corners - principal) / focal,
+        corners=rays,
     )
 
 

@@ -47,7 +47,10 @@ MARKERS_TOPIC = "/scan_node/markers"
 ESTIMATES_FOLDER, SCAN_FILE, REPORT_FILE = "estimates", "scan.json", "report.html"
 SHOWN_REASONS = 6
 """Kinds of rejected messages that are told apart at the end."""
-WAITED = "before the bag ended, or the parameter pairing_queue the wait"
+WAITED = (
+    "before the bag ended or more later pictures came than pairing_queue lets wait: record both with one "
+    "stamp, or raise that parameter"
+)
 
 
 class ShowsDistributions(Protocol):

@@ -12,6 +12,7 @@ import numpy as np
 
 from relpose_ros.estimates import Verdict
 from relpose_ros.scanning.incoming import stamp_text
+from relpose_ros.scanning.stamp_order import StampOrder
 from relpose_ros.views import MIN_VIEWS
 
 if TYPE_CHECKING:
@@ -27,13 +28,6 @@ SHORTEST_PAUSE_NS, LONGEST_PAUSE_NS = 200_000_000, 1_000_000_000
 """After a newcomer that gained nothing, how long the next ones are not tried (keep policy "spread"). The
 pause doubles each time: a camera that stands still must not keep the estimator busy for ever, and one that
 moves on is soon tried again. By stamps, so that a replay does the same."""
-
-LONGEST_LAG_NS = 60 * 10**9
-"""No camera delivers later than this behind another one: what is further ahead of a view, and alone, may be a
-garbage stamp."""
-
-_SEEN = 64
-"""Pictures remembered to tell one that comes raw and compressed: no transport lags by more."""
 
 _logger = logging.getLogger("relpose_ros")
 
@@ -65,30 +59,25 @@ class Work:
 class ScanBuffer:
     """The views of one object.
 
-    A view that was taken leaves only by the keep policy, by a confirmed backward jump of time, or because
-    someone asked for it: nothing that arrives can damage what is held. Not thread-safe by itself.
+    A view that was taken leaves only by the keep policy, by a confirmed backward jump of time, because
+    estimates fail with it and not without it, or because someone asked for it: nothing that arrives can
+    damage what is held. Not thread-safe by itself.
     """
 
     def __init__(self, object_id: str, settings: ScanSettings) -> None:
         """Make one without views."""
         self.object_id = object_id
         self.dropped = 0
-        """Views let go or declined by the keep policy, or forgotten after a jump of time."""
+        """Views declined or let go: by the keep policy, after a jump of time, as the cause of failing
+        estimates, or because someone asked."""
         self.declined = 0
         """Those among them that never had a place."""
         self._settings = settings
-        self._backward_jump_ns = round(settings.backward_jump_s * 1e9)
         self._views: list[View] = []
         self._candidates: deque[View] = deque()
         self._on_trial: View | None = None
         self._pause_ns = self._paused_until_ns = 0
-        self._newest_on: dict[str, int] = {}
-        self._newest_of: dict[tuple[str, str], int] = {}
-        """Of each camera: the same by topic and frame."""
-        self._suspects: dict[str, list[View]] = {}
-        """Views of one stamp on each topic, from cameras that are triggered together."""
-        self._seen: deque[tuple[int, str, str]] = deque(maxlen=_SEEN)
-        """Stamp and frame, which are what tells pictures apart whatever their topic, and that topic."""
+        self._order = StampOrder(self._all, round(settings.backward_jump_s * 1e9))
         self._changed = False
         self._failed = False
         """Whether the latest estimate failed, and no view came since."""
@@ -116,17 +105,17 @@ class ScanBuffer:
 
         Saves decoding it.
         """
-        if not self._all() or self._jumps_back(stamp_ns, frame_id, topic):
+        if not self._all() or self._order.jumps_back(stamp_ns, frame_id, topic):
             return None
-        if self._confirms_jump(stamp_ns, frame_id, topic):
+        if self._order.confirms_jump(stamp_ns, frame_id, topic):
             return None
-        if (stamp_ns, frame_id, topic) in self._seen:
+        if self._order.repeats(stamp_ns, frame_id, topic):
             text = f"a view with this stamp and frame_id {frame_id!r} came on this topic before"
             advice = "give each picture its own stamp, and each camera its own frame_id"
             return Decision(False, f"{text}: {advice}", rejected=True)
-        if self._was_seen(stamp_ns, frame_id):
+        if self._order.was_seen(stamp_ns, frame_id):
             return Decision(False, "a view with this stamp and frame was seen already")
-        own_ns = self._newest_of.get((topic, frame_id))
+        own_ns = self._order.newest_of(topic, frame_id)
         if own_ns is not None and stamp_ns < own_ns:
             late = (
                 f"it is {(own_ns - stamp_ns) / 1e9:.3f} s older than the newest view of {self.object_id!r} on"
@@ -146,32 +135,21 @@ class ScanBuffer:
     def add(self, view: View, topic: str) -> Decision:
         """Take a view, or say why not.
 
-        Views of one stamp are two where their frames differ: of cameras that are triggered together.
-
-        A stamp far behind the last one on its topic is a garbage stamp or a clock that jumped backwards,
-        unless it is ahead of the last one of its own camera, which is slow. The next message on the topic
-        tells which: if it is behind as well and in order, time did jump; or if both repeat what was seen
-        before, as in a bag too short for two messages far behind. Of a camera that is new on a topic of
-        others, only messages further apart than a jump tell: it may have begun with a few that were late.
+        Views of one stamp are two where their frames differ: of cameras that are triggered together. What a
+        stamp far behind says, `StampOrder` tells.
         """
         declined = self.declines(view.stamp_ns, view.frame_id, topic)
         if declined is not None:
             return declined
-        if self._confirms_jump(view.stamp_ns, view.frame_id, topic):
-            first = self._suspects[topic][0]
-            together = [
-                (each, origin)
-                for origin, views in self._suspects.items()
-                for each in views
-                if each.stamp_ns == first.stamp_ns
-            ]
-            self._follow_jump(first)
-            for each, origin in together:
-                if not self._was_seen(each.stamp_ns, each.frame_id):
+        if self._order.confirms_jump(view.stamp_ns, view.frame_id, topic):
+            suspects = self._order.suspects(topic)
+            self._follow_jump(suspects[0][0])
+            for each, origin in suspects:
+                if not self._order.was_seen(each.stamp_ns, each.frame_id):
                     self._take(each, origin)
-        elif self._jumps_back(view.stamp_ns, view.frame_id, topic):
-            self._suspect(view, topic)
-            than, newest_ns = "the last one on this topic", self._newest_on.get(topic, 0)
+        elif self._order.jumps_back(view.stamp_ns, view.frame_id, topic):
+            self._order.suspect(view, topic)
+            than, newest_ns = "the last one on this topic", self._order.newest_on(topic) or 0
             if newest_ns <= view.stamp_ns:
                 than, newest_ns = "the newest view", max(each.stamp_ns for each in self._all())
             behind = (newest_ns - view.stamp_ns) / 1e9
@@ -210,8 +188,9 @@ class ScanBuffer:
 
         Returns:
             Whether it is one of this scan: not of views that were forgotten meanwhile, nor with a newcomer
-            that the scan does not take. It takes one that looks from a newer direction than the view that it
-            replaces, unless the views held are enough and would be no more.
+            that the scan does not take. It takes one whose nearest neighbour in direction is further away, by
+            more than ``SPREAD_MARGIN``, than the two closest of the views held are from one another; unless
+            the views held are enough and would be no more.
         """
         if work.epoch != self._epoch:
             return False
@@ -269,7 +248,7 @@ class ScanBuffer:
     def change_settings(self, settings: ScanSettings) -> None:
         """Go on with other settings; views that are too many now leave by the new keep policy."""
         self._settings = settings
-        self._backward_jump_ns = round(settings.backward_jump_s * 1e9)
+        self._order.backward_jump_ns = round(settings.backward_jump_s * 1e9)
         views, most = self._all(), settings.max_views
         surplus = {"first": views[most:], "latest": views[:-most], "spread": []}[settings.keep]
         if surplus or len(self._views) != min(len(views), most):
@@ -307,15 +286,7 @@ class ScanBuffer:
         self.declined += 1
 
     def _note_arrival(self, stamp_ns: int, frame_id: str, topic: str) -> None:
-        """Time goes on in this topic: whatever lay far behind was garbage."""
-        self._seen.append((stamp_ns, frame_id, topic))
-        # A camera that delivers later does not turn the topic's clock back.
-        self._newest_on[topic] = max(stamp_ns, self._newest_on.get(topic, stamp_ns))
-        self._newest_of.pop((topic, frame_id), None)
-        self._newest_of[topic, frame_id] = stamp_ns
-        if len(self._newest_of) > _SEEN:  # a name of its own for each picture
-            del self._newest_of[next(iter(self._newest_of))]
-        self._suspects.pop(topic, None)
+        self._order.note(stamp_ns, frame_id, topic)
         # What is held, or a newcomer on trial, would wait for ever for an estimate that failed.
         self._changed |= self._failed
         self._failed = False
@@ -331,46 +302,11 @@ class ScanBuffer:
     def _is_paused(self, stamp_ns: int) -> bool:
         return self._settings.keep == "spread" and stamp_ns < self._paused_until_ns
 
-    def _jumps_back(self, stamp_ns: int, frame_id: str, topic: str) -> bool:
-        ahead = {view.stamp_ns for view in self._all() if view.stamp_ns > stamp_ns + LONGEST_LAG_NS}
-        if len(ahead) == 1:
-            return True
-        # Each topic's own clock, and each camera's: another one may lag behind by more than any jump.
-        newest_ns, own_ns = self._newest_on.get(topic), self._newest_of.get((topic, frame_id))
-        lags = own_ns is not None and own_ns < stamp_ns
-        return newest_ns is not None and not lags and stamp_ns <= newest_ns - self._backward_jump_ns
-
-    def _suspect(self, view: View, topic: str) -> None:
-        """Remember a view that may be the first after a jump, with those of its stamp."""
-        suspects = self._suspects.get(topic, [])
-        together = [each for each in suspects if each.stamp_ns == view.stamp_ns]
-        if suspects and not together and view.stamp_ns > suspects[0].stamp_ns:
-            return  # it is in order, but did not confirm the first yet
-        others = [each for each in together if each.frame_id != view.frame_id]
-        self._suspects[topic] = [*others, view]
-
-    def _confirms_jump(self, stamp_ns: int, frame_id: str, topic: str) -> bool:
-        suspects = self._suspects.get(topic)
-        if not suspects or stamp_ns <= suspects[0].stamp_ns:
-            return False
-        first = suspects[0]
-        if self._was_seen(first.stamp_ns, first.frame_id) and self._was_seen(stamp_ns, frame_id):
-            return True
-        if not self._jumps_back(stamp_ns, frame_id, topic):
-            return False
-        is_new = topic in self._newest_on and (topic, frame_id) not in self._newest_of
-        return not is_new or stamp_ns >= first.stamp_ns + self._backward_jump_ns
-
-    def _was_seen(self, stamp_ns: int, frame_id: str) -> bool:
-        picture = stamp_ns, frame_id
-        seen = any(each[:2] == picture for each in self._seen)
-        return seen or any((view.stamp_ns, view.frame_id) == picture for view in self._all())
-
     def _follow_jump(self, first: View) -> None:
         """Forget what lies after the first view of the time that counts from now on."""
         views = self._all()
         ahead = [view for view in views if view.stamp_ns > first.stamp_ns]
-        repeated = self._was_seen(first.stamp_ns, first.frame_id)
+        repeated = self._order.was_seen(first.stamp_ns, first.frame_id)
         lone = len({view.stamp_ns for view in ahead}) == 1 and len(views) > len(ahead)
         if lone and not repeated:
             text = "What was seen of %r with stamp %s is dropped: two later messages are older than that."
@@ -381,10 +317,7 @@ class ScanBuffer:
             newest, stamp = stamp_text(views[-1].stamp_ns), stamp_text(first.stamp_ns)
             _logger.warning(text, newest, stamp, self.object_id)
             self._forget(views)
-        self._newest_on.clear()
-        self._newest_of.clear()
-        self._suspects.clear()
-        self._seen.clear()
+        self._order.restart(seen_too=True)
 
     def _forget(self, views: list[View]) -> None:
         self.dropped += len(views)
@@ -397,9 +330,7 @@ class ScanBuffer:
         self._candidates = deque(left[self._settings.max_views :])
         self._changed, self._base = True, None
         if not left:
-            self._newest_on.clear()
-            self._newest_of.clear()
-            self._suspects.clear()
+            self._order.restart(seen_too=False)
 
     def _all(self) -> list[View]:
         """The views held and those whose place is not decided yet, oldest first."""

@@ -15,8 +15,6 @@ from relpose_ros.inference.verdict import without_room
 from relpose_ros.scanning.incoming import (
     REGION_SCALE,
     SURROUNDINGS_SCALE,
-    Arrival,
-    Pairing,
     ViewError,
     object_id_of,
     robot_pose,
@@ -28,6 +26,7 @@ from relpose_ros.scanning.incoming import (
 from relpose_ros.scanning.incoming import (
     Kind as Kind,  # a word of this module's interface
 )
+from relpose_ros.scanning.pairing import Arrival, Pairing
 from relpose_ros.scanning.robot_poses import RobotPoses
 from relpose_ros.scanning.scan_buffer import ScanBuffer
 from relpose_ros.views import MIN_VIEWS, Scan
@@ -36,7 +35,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from relpose_ros.estimates import ScanEstimate
-    from relpose_ros.scanning.incoming import ImagePair, Source
+    from relpose_ros.scanning.incoming import Source
+    from relpose_ros.scanning.pairing import ImagePair
     from relpose_ros.scanning.scan_buffer import Decision
     from relpose_ros.scanning.settings import ScanSettings
     from relpose_ros.views import View
@@ -59,7 +59,7 @@ class Receipt:
     """What became of a message."""
 
     accepted: bool
-    """Whether a view of it is held now, or one to which it gives a camera pose."""
+    """Whether its view is held now or waits for a trial, or one is held to which it gives a camera pose."""
     object_id: str
     """Whose view it was; empty where no view came of it (yet)."""
     reason: str
@@ -100,7 +100,7 @@ class ScanStatistics:
     views: int
     estimates: int
     dropped: int
-    """Views that the keep policy or a reset has let go, or never took."""
+    """Views declined or let go since the scan began, see ``ScanBuffer.dropped``."""
     latency_s: float | None
     """From receiving the newest view to having its estimate; None before the first estimate."""
     status: str

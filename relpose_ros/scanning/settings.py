@@ -250,8 +250,9 @@ class ScanSettings:
     def from_yaml(cls, path: Path) -> ScanSettings:
         """Settings from a ROS 2 parameter file (``/**: ros__parameters: ...``).
 
-        With several nodes in the file, those named ``/**``, ``scan_node`` or ``/scan_node`` count, a later
-        one over an earlier one. ``use_sim_time`` and ``qos_overrides`` are not the scanner's: passed over.
+        With several nodes in the file, those named ``/**``, ``/**/scan_node``, ``scan_node`` or
+        ``/scan_node`` count, a later one over an earlier one. ``use_sim_time`` and ``qos_overrides`` are not
+        the scanner's: passed over.
 
         Raises:
             SettingsError: The file cannot be read, is no parameter file, or holds a wrong value.

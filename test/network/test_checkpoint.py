@@ -169,7 +169,7 @@ def test_weights_that_are_no_plain_numbers_are_refused_by_name(
     compact: RelPose, tmp_path: Path, bias: torch.Tensor
 ) -> None:
     file = released_file(compact, tmp_path / "ckpt.pth", layers__1__bias=bias)
-    assert "no plain numbers layers.1.bias" in refusal(file)
+    assert "as anything but plain fractions layers.1.bias" in refusal(file)
 
 
 def test_a_name_with_and_without_prefix_is_refused(compact: RelPose, tmp_path: Path) -> None:

@@ -35,7 +35,9 @@ def test_what_there_is_not_is_refused_with_what_there_is() -> None:
         named_preset("huge")
     with pytest.raises(PresetError, match="no variant 'index'; choose among no-index, pair-context"):
         named_preset("paper", ["index"])
-    with pytest.raises(PresetError, match="no rotation 'spin' of networks; there are energy, regression"):
+    with pytest.raises(
+        PresetError, match="A network's rotation is 'spin'; it must be one of energy, regression"
+    ):
         replace(PRESETS["paper"], rotation="spin")  # type: ignore[arg-type]
 
 

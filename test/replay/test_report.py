@@ -21,7 +21,7 @@ from relpose_ros.replay.replay import replay
 from relpose_ros.replay.report import Cells, write_report, yaw_pitch_roll
 from relpose_ros.scanning.scanner import Result
 from relpose_ros.scanning.settings import ScanSettings
-from relpose_ros.views import BoundingBox, Intrinsics, Scan, View
+from relpose_ros.views import BoundingBox, Distortion, Intrinsics, Scan, View
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -191,6 +191,32 @@ def test_a_flat_covariance_can_be_drawn(
     write_report(tmp_path / "page.html", recording, {}, [], "bag")
     points = np.array(data_of((tmp_path / "page.html").read_text())["distributions"][0]["points"])
     assert np.ptp(points[:, :3], axis=0) == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("k1", "expected"),
+    [
+        # Of (x, y) = (-0.4, -0.3) and (0.1, 0.2) on the bent image, by x (1 + k1 r^2) solved by hand.
+        (0.2, [(-0.38251, -0.28688), (0.09903, 0.19806)]),
+        (-40.0, [(-0.4, -0.3), (0.1, 0.2)]),  # no ray is bent there: as if there were no lens
+    ],
+)
+def test_the_corners_of_a_picture_are_as_they_were_before_the_lens(k1: float, expected: list) -> None:
+    lens = Distortion((k1, 0.0, 0.0, 0.0))
+    size = 100 / 2.3  # its picture is 50 pixels wide, from 60 and 70 on
+    box = BoundingBox(85 - size / 2, 95 - size / 2, 85 + size / 2, 95 + size / 2)
+    view = View(
+        np.zeros((200, 200, 3), np.uint8),
+        box,
+        200,
+        200,
+        intrinsics=Intrinsics(100, 100, 100, 100),
+        distortion=lens,
+    )
+    recording = Recording("mug")
+    recording.add(Result(Scan("mug", (view,)), object()), 0)  # type: ignore[arg-type]
+    corners = recording.views[0].corners
+    np.testing.assert_allclose(corners[[0, 2]], expected, atol=1e-5)
 
 
 def test_a_picture_shows_the_square_about_the_box() -> None:

@@ -9,8 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relpose_ros.scanning.incoming import (
-    Arrival,
-    Pairing,
     Source,
     ViewError,
     object_id_of,
@@ -336,82 +334,6 @@ def test_a_view_holds_the_network_crop_as_far_as_there_is_a_picture(
     assert x0 + width >= min(full[0], x + half)
     assert y0 + height >= min(full[1], y + half)
     np.testing.assert_array_equal(view.image, pixels[y0 : y0 + height, x0 : x0 + width])
-
-
-def arrival(stamp: int, what: str = "") -> Arrival:
-    return Arrival((what, stamp), Source("topic", stamp, ""))
-
-
-def pairs(pairing: Pairing, kind: Any, *stamps: int, camera: str = "") -> list[tuple[Any, Any]]:
-    found = [pair for stamp in stamps for pair in pairing.add(kind, arrival(stamp, kind), camera)]
-    return [(pair.image.message, pair.info.message) for pair in found]
-
-
-def test_images_and_infos_meet_whichever_comes_first() -> None:
-    pairing = Pairing(5, 1000)
-    assert pairs(pairing, "image", 1, 2) == []
-    assert pairs(pairing, "camera_info", 2) == [(("image", 2), ("camera_info", 2))]
-    assert pairs(pairing, "camera_info", 3) == []
-    assert pairs(pairing, "image", 3) == [(("image", 3), ("camera_info", 3))]
-    assert pairing.waiting() == 1
-
-
-def test_one_info_serves_the_raw_and_the_compressed_picture() -> None:
-    pairing = Pairing(5, 1000)
-    assert pairs(pairing, "image", 1) == []
-    assert len(pairs(pairing, "camera_info", 1)) == 1
-    assert len(pairs(pairing, "compressed", 1)) == 1
-    assert pairs(pairing, "image", 2) == pairs(pairing, "compressed", 2) == []
-    assert len(pairs(pairing, "camera_info", 2)) == 2
-
-
-def test_cameras_are_not_mixed() -> None:
-    pairing = Pairing(5, 1000)
-    assert pairs(pairing, "image", 1, camera="left") == []
-    assert pairs(pairing, "camera_info", 1, camera="right") == []
-    assert len(pairs(pairing, "camera_info", 1, camera="left")) == 1
-
-
-def test_what_waits_longest_goes_when_there_is_too_much() -> None:
-    pairing = Pairing(3, 1000)
-    pairs(pairing, "image", *range(10))
-    assert (pairing.waiting(), pairing.images_alone) == (3, 7)
-    assert len(pairs(pairing, "camera_info", *range(10))) == 3
-    assert (pairing.waiting(), pairing.images_alone) == (0, 7)
-
-
-def test_pairing_goes_on_after_time_jumped_back() -> None:
-    pairing = Pairing(30, 1000)
-    pairs(pairing, "image", *range(0, 20_000, 500))
-    assert pairing.waiting() == 30
-    # The bag starts again; only images before had lost their infos.
-    found = []
-    for stamp in range(0, 20_000, 500):
-        found += pairs(pairing, "image", stamp) + pairs(pairing, "camera_info", stamp)
-    assert [info[1] for _, info in found] == list(range(0, 20_000, 500))
-    assert pairing.waiting() == 0, "the images of the first round are forgotten"
-
-
-def test_a_garbage_stamp_costs_no_waiting_image() -> None:
-    pairing = Pairing(30, 1000)
-    pairs(pairing, "image", 5000, 5100, 0, 5200, 10**18, 5300, 5400)
-    assert len(pairs(pairing, "camera_info", 5000, 5100, 5200, 5300, 5400)) == 5
-
-
-@settings(max_examples=200)
-@given(
-    st.lists(
-        st.tuples(st.sampled_from(["image", "compressed", "camera_info"]), st.integers(0, 12)), max_size=60
-    )
-)
-def test_pairs_always_have_one_stamp_and_memory_is_bounded(arrivals: list[tuple[Any, int]]) -> None:
-    pairing = Pairing(4, 3)
-    for kind, stamp in arrivals:
-        for pair in pairing.add(kind, arrival(stamp, kind), ""):
-            assert pair.image.source.stamp_ns == pair.info.source.stamp_ns == stamp
-            assert pair.info.message[0] == "camera_info"
-            assert pair.image.message[0] != "camera_info"
-        assert pairing.waiting() <= 8
 
 
 DEVIATIONS = (0.005, 0.01)
