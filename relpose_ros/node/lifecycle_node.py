@@ -18,23 +18,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from rclpy.qos import QoSPolicyKind
 from std_srvs.srv import Trigger
-from visualization_msgs.msg import MarkerArray
 
 from relpose_ros.errors import RelPoseError
-from relpose_ros.msg import ObjectView, ScanEstimate
 from relpose_ros.node.parameters import (
     FORTH,
     changed_settings,
@@ -46,11 +41,19 @@ from relpose_ros.node.reports import (
     NodeHealth,
     Throttle,
     diagnostic_status,
-    loss_advice,
     missing_images_advice,
     pairing_advice,
-    qos_advice,
     twin_advice,
+)
+from relpose_ros.node.topics import (
+    DIAGNOSTICS_QOS,
+    DIAGNOSTICS_TOPIC,
+    INPUTS,
+    OUTPUTS,
+    OVERRIDABLE,
+    RESULT_QOS,
+    IncompatibleQos,
+    Inputs,
 )
 from relpose_ros.scanning.outgoing import TYPE_NAMES, estimate_message, markers, pose_array
 from relpose_ros.scanning.scanner import UNPAIRED_AFTER_S, Scanner
@@ -66,50 +69,8 @@ if TYPE_CHECKING:
 
     Transition: TypeAlias = Callable[["ScanNode", LifecycleState], TransitionCallbackReturn]
 
-BURST = 50
-"""Messages that a subscription keeps while the callbacks are busy with others."""
-LOSS_REPEAT_AFTER_S = 60.0
-"""Lost messages are told this often: a scan can do with some of a camera's frames."""
 ADAPT_PERIOD_S = 0.2
 """How often the reliability that publishers offer is looked at."""
-
-INPUTS: tuple[tuple[Kind, str, Any, str], ...] = (
-    ("object_view", "object_view", ObjectView, ""),
-    ("image", "image", Image, "raw"),
-    ("compressed", "image/compressed", CompressedImage, "compressed"),
-    ("camera_info", "camera_info", CameraInfo, ""),
-    ("camera_pose", "camera_pose", PoseStamped, ""),
-    ("camera_pose", "camera_pose_with_covariance", PoseWithCovarianceStamped, ""),
-)
-"""Kind, topic, type, and the image transport that must be asked for (empty: always there)."""
-
-OUTPUTS: tuple[tuple[str, Any], ...] = (
-    ("~/estimate", ScanEstimate),
-    ("~/poses", PoseArray),
-    ("~/markers", MarkerArray),
-)
-
-INPUT_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=BURST,
-    reliability=ReliabilityPolicy.RELIABLE,  # until a best effort publisher joins
-    durability=DurabilityPolicy.VOLATILE,
-)
-RESULT_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,  # with transient local: matches every subscription
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-DIAGNOSTICS_TOPIC = "/diagnostics"
-DIAGNOSTICS_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10)
-OVERRIDABLE = QoSOverridingOptions(
-    (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
-)
-# A read-only parameter could not tell a reliability that follows the publishers.
-OVERRIDABLE_BUT_RELIABILITY = QoSOverridingOptions(
-    [each for each in OVERRIDABLE.policy_kinds if each != QoSPolicyKind.RELIABILITY]
-)
 
 
 def _guarded(transition: Transition) -> Transition:
@@ -156,7 +117,8 @@ class ScanNode(LifecycleNode):
         self._closing = False
         self._failure = ""
         self._failing = False
-        self._inputs: list[Any] = []
+        self._incompatible = IncompatibleQos(self)
+        self._inputs = Inputs(self, self._incompatible, self._parameter_overrides, lambda: self._active)
         self._services_of_scan: list[Any] = []
         self._outputs: dict[str, Any] = {}
         self._shown: Result | None = None
@@ -164,12 +126,8 @@ class ScanNode(LifecycleNode):
         self._unsaid: list[Result] = []
         """What is to be taken back as soon as somebody can hear it."""
         self._jump: Any = None
-        self._incompatible: dict[str, tuple[bool, str]] = {}
         self._longest_callback_s: dict[str, float] = {}
-        self._publishers_of: dict[str, int] = {}
-        self._lost: dict[str, int] = {}
         self._throttle = Throttle()
-        self._loss_throttle = Throttle(LOSS_REPEAT_AFTER_S)
         # A service that waits for an estimate must not hold up the callbacks of images.
         self._waiting_group = MutuallyExclusiveCallbackGroup()
         self._diagnostics = self.create_publisher(
@@ -213,8 +171,6 @@ class ScanNode(LifecycleNode):
         if self._state_machine.current_state[1] != "finalized":
             self.trigger_shutdown()
 
-    # rclpy calls the transitions.
-
     @_guarded
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the weights; make topics, services and the worker."""
@@ -231,7 +187,8 @@ class ScanNode(LifecycleNode):
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="estimate")
         try:
             self._make_outputs()
-            self._make_inputs(self._scanner)
+            on_message = functools.partial(self._on_message, self._scanner)
+            self._inputs.open(self._settings.image_transports, on_message)
         except (RuntimeError, ParameterException) as err:  # rclpy's own errors are RuntimeErrors
             self._release()
             return self._fail(f"The qos_overrides given are refused: {err}. Start the node with others.")
@@ -252,8 +209,7 @@ class ScanNode(LifecycleNode):
         self._active = True
         self._submit(self._publish_unsaid)
         self._ask_for_estimate()
-        topics = ", ".join(each.topic_name for each in self._inputs)
-        self.get_logger().info(f"Waiting for views on {topics}.")
+        self.get_logger().info(f"Waiting for views on {', '.join(self._inputs.topics)}.")
         return result
 
     @_guarded
@@ -284,8 +240,6 @@ class ScanNode(LifecycleNode):
         self._release()
         return super().on_error(state)
 
-    # What configuring makes.
-
     def _fail(self, failure: str) -> TransitionCallbackReturn:
         self._failure = failure
         self.get_logger().error(failure)
@@ -309,7 +263,7 @@ class ScanNode(LifecycleNode):
         for name, message_type in OUTPUTS:
             topic = self.resolve_topic_name(name)
             events = PublisherEventCallbacks(
-                incompatible_qos=functools.partial(self._on_incompatible_qos, topic, False)
+                incompatible_qos=functools.partial(self._on_incompatible_output, topic)
             )
             self._outputs[name] = self.create_lifecycle_publisher(
                 message_type,
@@ -319,70 +273,17 @@ class ScanNode(LifecycleNode):
                 qos_overriding_options=OVERRIDABLE,
             )
 
-    def _make_inputs(self, scanner: Scanner) -> None:
-        transports = self._settings.image_transports
-        for kind, name, message_type, transport in INPUTS:
-            if transport and transport not in transports:
-                continue
-            callback = functools.partial(self._on_message, scanner, kind, self.resolve_topic_name(name))
-            self._inputs.append(self._subscribe(message_type, name, callback, INPUT_QOS.reliability))
-
-    def _subscribe(
-        self, message_type: Any, name: str, callback: Callable[[Any], None], reliability: ReliabilityPolicy
-    ) -> Any:
-        topic = self.resolve_topic_name(name)
-        events = SubscriptionEventCallbacks(
-            incompatible_qos=functools.partial(self._on_incompatible_qos, topic, True),
-            matched=functools.partial(self._on_matched, topic),
-            message_lost=functools.partial(self._on_message_lost, topic),
-        )
-        self._publishers_of[topic] = 0
-        qos = copy(INPUT_QOS)  # rclpy writes the overrides into the profile
-        qos.reliability = reliability
-        return self.create_subscription(
-            message_type,
-            name,
-            callback,
-            qos,
-            event_callbacks=events,
-            qos_overriding_options=OVERRIDABLE_BUT_RELIABILITY if self._adapts(topic) else OVERRIDABLE,
-        )
-
-    def _adapts(self, topic: str) -> bool:
-        """Whether the subscription's reliability follows the publishers: an override stays as it is."""
-        return f"qos_overrides.{topic}.subscription.reliability" not in self._parameter_overrides
+    def _on_incompatible_output(self, topic: str, event: Any) -> None:
+        self._incompatible.note(topic, QoSPolicyKind(event.last_policy_kind), subscribing=False)
 
     def _adapt_inputs(self) -> None:
-        """Ask for reliable delivery where every publisher offers it, and for best effort elsewhere."""
         # A transition may take long, and makes or releases the inputs itself.
-        if not self.in_transition.acquire(blocking=False):
-            return
-        try:
-            for k, subscription in enumerate(self._inputs):
-                topic = subscription.topic_name
-                if self._closing or not self._adapts(topic):
-                    continue
-                offered = {each.qos_profile.reliability for each in self.get_publishers_info_by_topic(topic)}
-                best_effort = ReliabilityPolicy.BEST_EFFORT in offered
-                wanted = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-                if wanted != subscription.qos_profile.reliability:
-                    self._inputs[k] = self._subscribe_anew(subscription, wanted)
-                    why = "a publisher is" if best_effort else "every publisher is"
-                    now = wanted.name.lower().replace("_", " ")
-                    self.get_logger().info(f"{topic} is subscribed {now} from now on, as {why}.")
-        finally:
-            self.in_transition.release()
-
-    def _subscribe_anew(self, old: Any, reliability: ReliabilityPolicy) -> Any:
-        """The subscription that takes the place of ``old``, once what has come there is taken."""
-        with old.handle:
-            take = functools.partial(old.handle.take_message, old.msg_type, old.raw)
-            waiting = list(iter(take, None))
-        self.destroy_subscription(old)
-        subscription = self._subscribe(old.msg_type, old.topic, old.callback, reliability)
-        for message, _ in waiting:
-            old.callback(message)
-        return subscription
+        if self.in_transition.acquire(blocking=False):
+            try:
+                if not self._closing:
+                    self._inputs.follow_publishers()
+            finally:
+                self.in_transition.release()
 
     def _release(self) -> None:
         self._active = False
@@ -392,22 +293,17 @@ class ScanNode(LifecycleNode):
             worker.shutdown(wait=True, cancel_futures=True)
         if self._jump is not None:
             self._jump.unregister()
-        for subscription in self._inputs:
-            self.destroy_subscription(subscription)
+        self._inputs.close()
         for service in self._services_of_scan:
             self.destroy_service(service)
         for publisher in self._outputs.values():
             self.destroy_lifecycle_publisher(publisher)
-        self._inputs, self._services_of_scan, self._outputs = [], [], {}
+        self._services_of_scan, self._outputs = [], {}
         self._scanner = self._estimator = self._jump = self._shown = None
         self._jobs = set()
         self._estimate_asked = self._failing = False
         self._incompatible.clear()
         self._longest_callback_s.clear()
-        self._publishers_of.clear()
-        self._lost.clear()
-
-    # Messages in.
 
     def _on_message(self, scanner: Scanner, kind: Kind, topic: str, message: Any) -> None:
         if not self._active:
@@ -431,27 +327,6 @@ class ScanNode(LifecycleNode):
             scanner.reset(f"the clock jumped backwards by {-jump.delta.nanoseconds * 1e-9:.3f} s")
             if self._active:
                 self._ask_for_estimate()
-
-    def _on_incompatible_qos(self, topic: str, subscribing: bool, event: Any) -> None:
-        policy = QoSPolicyKind(event.last_policy_kind)
-        if subscribing and policy == QoSPolicyKind.RELIABILITY and self._adapts(topic):
-            return
-        advice = qos_advice(topic, policy, subscribing=subscribing)
-        self._incompatible[topic] = (subscribing, advice)
-        self.get_logger().warning(advice)
-
-    def _on_matched(self, topic: str, event: Any) -> None:
-        self._publishers_of[topic] = event.current_count
-
-    def _on_message_lost(self, topic: str, event: Any) -> None:
-        # The event's total begins anew with a subscription.
-        self._lost[topic] = self._lost.get(topic, 0) + event.total_count_change
-        if self._active:
-            line = self._loss_throttle.pass_on(topic, loss_advice(topic, self._lost[topic]))
-            if line is not None:
-                self.get_logger().warning(line)
-
-    # Estimates out: the worker's side.
 
     def _ask_for_estimate(self) -> None:
         """Have the worker estimate what changed. Views that come while it works wait for its next round."""
@@ -519,8 +394,6 @@ class ScanNode(LifecycleNode):
         unsaid, self._unsaid = self._unsaid, []
         self._publish(unsaid)
 
-    # Services.
-
     def _on_reset(self, _: Any, response: Any) -> Any:
         scanner = self._scanner_if_active(response)
         if scanner is not None:
@@ -574,8 +447,6 @@ class ScanNode(LifecycleNode):
             response.success = False
             return response
 
-    # Parameters.
-
     def _tell_unknown_parameters(self) -> list[str]:
         subscribed = {self.resolve_topic_name(each[1]) for each in INPUTS}
         published = {self.resolve_topic_name(each[0]) for each in OUTPUTS} | {DIAGNOSTICS_TOPIC}
@@ -611,8 +482,6 @@ class ScanNode(LifecycleNode):
         if old.diagnostics_period_s != self._settings.diagnostics_period_s:
             self._set_health_timer()
 
-    # Diagnostics.
-
     def _set_health_timer(self) -> None:
         if self._health_timer is not None:
             self.destroy_timer(self._health_timer)
@@ -639,17 +508,17 @@ class ScanNode(LifecycleNode):
         if self.count_publishers(estimates) > 1:
             advice.append(twin_advice(estimates))
         if statistics is not None and (statistics.unpaired_s or 0.0) > UNPAIRED_AFTER_S:
-            advice.append(pairing_advice(infos, self._publishers_of.get(infos, 0)))
+            advice.append(pairing_advice(infos, self._inputs.publishers.get(infos, 0)))
         elif statistics is not None and statistics.images_missing:
             advice += self._advice_on_missing_images()
         return advice
 
     def _advice_on_missing_images(self) -> list[str]:
         topics = {kind: self.resolve_topic_name(name) for kind, name, _, _ in INPUTS}
-        images = [topics[each] for each in ("image", "compressed") if topics[each] in self._publishers_of]
-        publishers = {topic: self._publishers_of[topic] for topic in images}
+        images = [topics[each] for each in ("image", "compressed") if topics[each] in self._inputs.publishers]
+        publishers = {topic: self._inputs.publishers[topic] for topic in images}
         # Views that bring their own camera matrix leave a camera's infos without a use.
-        if not any(publishers.values()) and self._publishers_of.get(topics["object_view"]):
+        if not any(publishers.values()) and self._inputs.publishers.get(topics["object_view"]):
             return []
         return [missing_images_advice(publishers)]
 
@@ -658,24 +527,16 @@ class ScanNode(LifecycleNode):
             state=self._state_machine.current_state[1],
             failure=self._failure,
             failing=self._failing,
-            publishers=dict(self._publishers_of),
-            lost=dict(self._lost),
+            publishers=dict(self._inputs.publishers),
+            lost=dict(self._inputs.lost),
             longest_callbacks_s=dict(self._longest_callback_s),
-            incompatible=self._incompatible_now(),
+            incompatible=self._incompatible.now(),
             advice=self._advice,
         )
         status = diagnostic_status(self.get_fully_qualified_name(), health, statistics)
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
-
-    def _incompatible_now(self) -> dict[str, str]:
-        """The advice for each topic whose other end is still there."""
-        for topic, (subscribing, _) in list(self._incompatible.items()):
-            others = self.count_publishers(topic) if subscribing else self.count_subscribers(topic)
-            if others == 0:
-                del self._incompatible[topic]
-        return {topic: advice for topic, (_, advice) in self._incompatible.items()}
 
 
 @functools.cache

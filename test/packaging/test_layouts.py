@@ -23,7 +23,7 @@ def rviz() -> dict[str, Any]:
 
 
 def test_rviz_shows_the_nodes_topics_in_the_object_frame(rviz: dict[str, Any]) -> None:
-    node = pytest.importorskip("relpose_ros.node.lifecycle_node", reason="ROS 2 is not installed")
+    node = pytest.importorskip("relpose_ros.node.topics", reason="ROS 2 is not installed")
     published = {
         name.replace("~", "/scan_node"): message_type.__name__ for name, message_type in node.OUTPUTS
     }
