@@ -73,7 +73,7 @@ class PairRotation:
     solution_probability: float
     """Probability that the true rotation lies within 15 degrees of the final poses' relative rotation."""
     solution_angle: float
-    """Angle from the final poses' relative rotation to the nearest mode, rad."""
+    """Angle from the final poses' relative rotation to the nearest of the modes, rad."""
     evidence: Evidence = Evidence.LEARNED
 
 

@@ -111,6 +111,8 @@ class RobotPose:
     covariance: npt.NDArray[np.float64]
     """(6, 6) of x, y, z and the rotation about X, Y, Z, fixed axes of the robot's frame
     (geometry_msgs/PoseWithCovariance): m^2, rad^2."""
+    stated: bool = True
+    """Whether that covariance came with the pose; else it is what the user said of all poses."""
 
 
 @dataclass(frozen=True, eq=False)

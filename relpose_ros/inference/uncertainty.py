@@ -80,7 +80,7 @@ def describe_pairs(
     covariances = _second_moments(distributions, centres[:, 0], masses) * widening[:, None, None]
     within = _share(distributions, masses, centres[:, 0])
     agreeing = _share(distributions, masses, solved)
-    to_modes = _nearest_modes(distributions, solved[:, None])[0]
+    to_modes = _turned_by(_traces(solved[:, None], centres)[:, 0].masked_fill(~heavy, -math.inf).amax(1))
     pairs = []
     for pair, count in enumerate(heavy.sum(1).tolist()):
         modes = tuple(
@@ -105,7 +105,7 @@ def describe_pairs(
                 ambiguous=ambiguous,
                 ambiguity_angle=_angle(modes[0], modes[1]) if ambiguous else 0.0,
                 solution_probability=float(agreeing[pair]),
-                solution_angle=float(to_modes[pair, 0]),
+                solution_angle=float(to_modes[pair]),
                 evidence=evidence[pair],
             )
         )

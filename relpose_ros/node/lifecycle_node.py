@@ -40,10 +40,12 @@ from relpose_ros.node.parameters import (
 from relpose_ros.node.reports import (
     NodeHealth,
     Throttle,
+    TopicWatch,
     diagnostic_status,
     missing_images_advice,
     pairing_advice,
     twin_advice,
+    type_advice,
 )
 from relpose_ros.node.topics import (
     DIAGNOSTICS_QOS,
@@ -54,10 +56,12 @@ from relpose_ros.node.topics import (
     RESULT_QOS,
     IncompatibleQos,
     Inputs,
+    TopicError,
+    require_topics_of_their_own,
 )
 from relpose_ros.scanning.outgoing import TYPE_NAMES, estimate_message, markers, pose_array
 from relpose_ros.scanning.scanner import UNPAIRED_AFTER_S, Scanner
-from relpose_ros.scanning.settings import SettingsError
+from relpose_ros.scanning.settings import MEANT, SettingsError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -105,18 +109,19 @@ class ScanNode(LifecycleNode):
         self.in_transition = threading.RLock()
         super().__init__("scan_node", **kwargs)
         self._settings = declare_parameters(self)
-        self._ignored = self._tell_unknown_parameters()
-        self._advice = self._ignored
+        self._misspelt = self._tell_unknown_parameters()
+        self._advice = self._misspelt
         self._scanner: Scanner | None = None
         self._estimator: Estimator | None = None
         self._worker: ThreadPoolExecutor | None = None
         self._jobs: set[Future[Any]] = set()
         self._jobs_lock = threading.Lock()
         self._estimate_asked = False
+        self._telling = threading.Lock()
+        """Held while results go out: none goes that was forgotten before a service said so."""
         self._active = False
         self._closing = False
         self._failure = ""
-        self._failing = False
         self._incompatible = IncompatibleQos(self)
         self._inputs = Inputs(self, self._incompatible, self._parameter_overrides, lambda: self._active)
         self._services_of_scan: list[Any] = []
@@ -128,8 +133,10 @@ class ScanNode(LifecycleNode):
         self._jump: Any = None
         self._longest_callback_s: dict[str, float] = {}
         self._throttle = Throttle()
-        # A service that waits for an estimate must not hold up the callbacks of images.
-        self._waiting_group = MutuallyExclusiveCallbackGroup()
+        self._topic_watch = TopicWatch()
+        # A service that waits for an estimate must not hold up the callbacks of images, and what waits for
+        # one to be done must not silence the diagnostics.
+        self._waiting_group, self._health_group = (MutuallyExclusiveCallbackGroup() for _ in range(2))
         self._diagnostics = self.create_publisher(
             DiagnosticArray, DIAGNOSTICS_TOPIC, copy(DIAGNOSTICS_QOS), qos_overriding_options=OVERRIDABLE
         )
@@ -186,12 +193,18 @@ class ScanNode(LifecycleNode):
         self._estimator, self._scanner = estimator, Scanner(estimator, self._settings)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="estimate")
         try:
+            require_topics_of_their_own(self, self._settings.image_transports)
             self._make_outputs()
             on_message = functools.partial(self._on_message, self._scanner)
             self._inputs.open(self._settings.image_transports, on_message)
+        except TopicError as err:
+            self._release()
+            return self._fail(str(err))
         except (RuntimeError, ParameterException) as err:  # rclpy's own errors are RuntimeErrors
             self._release()
-            return self._fail(f"The qos_overrides given are refused: {err}. Start the node with others.")
+            overridden = any(name.startswith("qos_overrides.") for name in self._parameter_overrides)
+            what = "The qos_overrides given are" if overridden else "The topics' names or types are"
+            return self._fail(f"{what} refused: {err}. Start the node with others.")
         for name, callback, group in (
             ("~/reset", self._on_reset, None),
             ("~/drop_last_view", self._on_drop_last_view, None),
@@ -301,7 +314,7 @@ class ScanNode(LifecycleNode):
         self._services_of_scan, self._outputs = [], {}
         self._scanner = self._estimator = self._jump = self._shown = None
         self._jobs = set()
-        self._estimate_asked = self._failing = False
+        self._estimate_asked = False
         self._incompatible.clear()
         self._longest_callback_s.clear()
 
@@ -324,7 +337,8 @@ class ScanNode(LifecycleNode):
     def _on_clock_jump(self, jump: Any) -> None:
         scanner = self._scanner
         if scanner is not None:
-            scanner.reset(f"the clock jumped backwards by {-jump.delta.nanoseconds * 1e-9:.3f} s")
+            with self._telling:
+                scanner.reset(f"the clock jumped backwards by {-jump.delta.nanoseconds * 1e-9:.3f} s")
             if self._active:
                 self._ask_for_estimate()
 
@@ -365,10 +379,16 @@ class ScanNode(LifecycleNode):
         """One round of estimates, published."""
         if self._estimator is not None:
             self._estimator.rest_on(self._settings.evidence_settings)
-        failed_before = scanner.statistics().failed
         results = estimate()
-        self._failing = scanner.statistics().failed > failed_before
-        self._publish(results)
+        with self._telling:
+            self._publish([each for each in results if not each.estimate.cameras or scanner.stands(each)])
+        return results
+
+    def _estimate_all(self, scanner: Scanner) -> list[Result]:
+        """Each scan anew, published as soon as it is estimated."""
+        results: list[Result] = []
+        for object_id in scanner.objects():
+            results += self._estimate(scanner, functools.partial(scanner.estimate_now, object_id))
         return results
 
     def _publish(self, results: Sequence[Result]) -> None:
@@ -383,7 +403,7 @@ class ScanNode(LifecycleNode):
                 self._outputs["~/poses"].publish(pose_array(estimate, scan, types, frame))
                 self._outputs["~/markers"].publish(markers(estimate, scan, types, frame))
                 self._shown = result if estimate.cameras else None
-            else:
+            elif self._scanner is not None and self._scanner.stands(shown):
                 # Who joins late hears the last message: that is to be what stands of the object shown.
                 again = estimate_message(shown.estimate, shown.scan, types, frame)
                 self._outputs["~/estimate"].publish(again)
@@ -397,7 +417,8 @@ class ScanNode(LifecycleNode):
     def _on_reset(self, _: Any, response: Any) -> Any:
         scanner = self._scanner_if_active(response)
         if scanner is not None:
-            forgotten = scanner.reset("a client asked for it")
+            with self._telling:
+                forgotten = scanner.reset("a client asked for it")
             self._ask_for_estimate()
             response.success, response.message = True, f"{forgotten} views forgotten."
         return response
@@ -405,7 +426,8 @@ class ScanNode(LifecycleNode):
     def _on_drop_last_view(self, _: Any, response: Any) -> Any:
         scanner = self._scanner_if_active(response)
         if scanner is not None:
-            receipt = scanner.drop_last_view()
+            with self._telling:
+                receipt = scanner.drop_last_view()
             self._ask_for_estimate()
             response.success, response.message = receipt.accepted, receipt.reason
         return response
@@ -415,7 +437,7 @@ class ScanNode(LifecycleNode):
         if scanner is None:
             return response
 
-        job = self._submit(lambda: self._estimate(scanner, scanner.estimate_now))
+        job = self._submit(functools.partial(self._estimate_all, scanner))
         try:
             results = job.result() if job is not None else None
         except CancelledError:
@@ -424,8 +446,8 @@ class ScanNode(LifecycleNode):
             response.success, response.message = False, "The node stopped before the estimate was made."
         elif not (estimates := [each.estimate for each in results if each.estimate.cameras]):
             response.success = False
-            failure = scanner.statistics().last_failure if self._failing else ""
-            response.message = failure or "No object has two views yet."
+            failures = (scan.failure for scan in scanner.statistics().scans.values())
+            response.message = next(filter(None, failures), "No object has two views yet.")
         else:
             response.success = True
             response.message = "; ".join(f"{each.object_id}: {each.status}" for each in estimates)
@@ -448,6 +470,10 @@ class ScanNode(LifecycleNode):
             return response
 
     def _tell_unknown_parameters(self) -> list[str]:
+        """Log those that do nothing, and give those back that are a known one misspelt.
+
+        A file that several nodes share names the others' too: nothing that diagnostics should go on about.
+        """
         subscribed = {self.resolve_topic_name(each[1]) for each in INPUTS}
         published = {self.resolve_topic_name(each[0]) for each in OUTPUTS} | {DIAGNOSTICS_TOPIC}
         overridable = [
@@ -460,7 +486,7 @@ class ScanNode(LifecycleNode):
         unknown = unknown_parameters(self._parameter_overrides, overridable)
         for sentence in unknown:
             self.get_logger().warning(sentence)
-        return unknown
+        return [sentence for sentence in unknown if MEANT in sentence]
 
     def _judge_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         configured = self.get_fully_qualified_name() if self._scanner is not None else ""
@@ -488,13 +514,16 @@ class ScanNode(LifecycleNode):
         # Steady, so that it goes on while simulated time stands still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._health_timer = self.create_timer(
-            self._settings.diagnostics_period_s, self._look_after_itself, clock=steady
+            self._settings.diagnostics_period_s,
+            self._look_after_itself,
+            callback_group=self._health_group,
+            clock=steady,
         )
 
     def _look_after_itself(self) -> None:
         scanner = self._scanner
         statistics = scanner.statistics() if scanner is not None else None
-        told, self._advice = self._advice, [*self._advice_on_topics(statistics), *self._ignored]
+        told, self._advice = self._advice, [*self._advice_on_topics(statistics), *self._misspelt]
         for sentence in self._advice:
             if sentence not in told:
                 self.get_logger().warning(sentence)
@@ -507,8 +536,11 @@ class ScanNode(LifecycleNode):
         estimates, infos = self.resolve_topic_name(OUTPUTS[0][0]), self.resolve_topic_name("camera_info")
         if self.count_publishers(estimates) > 1:
             advice.append(twin_advice(estimates))
+        if self._inputs.of_other_types:
+            return [*advice, *(type_advice(*each) for each in self._inputs.of_other_types)]
         if statistics is not None and (statistics.unpaired_s or 0.0) > UNPAIRED_AFTER_S:
-            advice.append(pairing_advice(infos, self._inputs.publishers.get(infos, 0)))
+            publishers = self._inputs.publishers.get(infos, 0)
+            advice.append(pairing_advice(infos, publishers, statistics.frames_apart))
         elif statistics is not None and statistics.images_missing:
             advice += self._advice_on_missing_images()
         return advice
@@ -526,11 +558,11 @@ class ScanNode(LifecycleNode):
         health = NodeHealth(
             state=self._state_machine.current_state[1],
             failure=self._failure,
-            failing=self._failing,
             publishers=dict(self._inputs.publishers),
             lost=dict(self._inputs.lost),
             longest_callbacks_s=dict(self._longest_callback_s),
             incompatible=self._incompatible.now(),
+            troubles=self._topic_watch.troubles(statistics, self._inputs.lost),
             advice=self._advice,
         )
         status = diagnostic_status(self.get_fully_qualified_name(), health, statistics)

@@ -27,11 +27,16 @@ class LogForwarder(logging.Handler):
     def __init__(self, ros_logger: Any) -> None:
         super().__init__()
         self._ros = ros_logger
+        self._throttle = Throttle()
         self.setFormatter(logging.Formatter("%(message)s"))
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log one record. A line of its own for each severity: rclpy refuses a call site that changes it."""
-        text = self.format(record)
+        text: str | None = self.format(record)
+        if record.levelno >= logging.WARNING:
+            text = self._throttle.pass_on(record.levelname, text or "")
+        if text is None:
+            return
         if record.levelno >= logging.ERROR:
             self._ros.error(text)
         elif record.levelno >= logging.WARNING:
@@ -99,13 +104,20 @@ def loss_advice(topic: str, lost: int) -> str:
     return f"{topic}: messages are lost on the way, {lost} so far. {AGAINST_LOSS}"
 
 
-def pairing_advice(topic: str, publishers: int) -> str:
-    """What to do about images of which no view comes, because no camera info has their stamp.
+def pairing_advice(topic: str, publishers: int, frames_apart: tuple[str, str] | None = None) -> str:
+    """What to do about images of which no view comes, because no camera info has their stamp and frame.
 
     Args:
         topic: Of the camera infos, as it is on the graph, remapped.
         publishers: How many nodes publish it.
+        frames_apart: Of an image and a camera info of one stamp, where they differ.
     """
+    if frames_apart is not None:
+        image, info = frames_apart
+        return (
+            f"Images come in with frame_id {image!r}, and what has their stamps on {topic} with {info!r}, "
+            "which may be another camera's: give both the frame_id of the camera's optical frame."
+        )
     if publishers == 0:
         return f"Images come in, but nobody publishes {topic}: remap camera_info, or send ObjectView."
     return f"Images come in, but no message on {topic} has the stamp of one: give both the same header.stamp."
@@ -125,9 +137,54 @@ def missing_images_advice(publishers: Mapping[str, int]) -> str:
     return f"{topics}: most camera infos find no image, so images get lost on the way. {AGAINST_LOSS}"
 
 
+def type_advice(topic: str, name: str, carried: str, wanted: str, instead: str) -> str:
+    """What to do about a topic whose messages are not of the type that is read there.
+
+    Args:
+        topic: As it is on the graph, remapped.
+        name: The node's own name for it.
+        carried: The type that a publisher sends there.
+        wanted: The type that the node reads there.
+        instead: The node's own name for a topic of the type that comes; empty where it has none.
+    """
+    where = f"remap {instead} to it and {name} elsewhere" if instead else f"remap {name} to one of that type"
+    return f"{topic} carries {carried}, and {wanted} is read there: {where}."
+
+
 def twin_advice(topic: str) -> str:
     """What to do about another node that publishes our topic."""
     return f"Somebody else publishes {topic} too: start one of two nodes with `-r __node:=NAME`."
+
+
+class TopicWatch:
+    """Tells topics of which nothing could be used between two looks."""
+
+    def __init__(self) -> None:
+        """Begin with the first look."""
+        self._before: dict[str, tuple[int, int, int, int]] = {}
+
+    def troubles(self, statistics: Statistics | None, lost: Mapping[str, int]) -> list[str]:
+        """A sentence for each topic whose messages were all rejected since the last look, or mostly lost.
+
+        Args:
+            statistics: Of the scanner; None where there is none.
+            lost: Messages that were sent and never came, by topic.
+        """
+        topics = {} if statistics is None else statistics.topics
+        now = {
+            topic: (counts.received, counts.used, counts.rejected, lost.get(topic, 0))
+            for topic, counts in topics.items()
+        } | {topic: (0, 0, 0, count) for topic, count in lost.items() if topic not in topics}
+        told = []
+        for topic, counts in now.items():
+            before = self._before.get(topic, (0, 0, 0, 0))
+            received, used, rejected, gone = (new - old for new, old in zip(counts, before, strict=True))
+            if rejected > 0 and used <= 0:
+                told.append(topics[topic].last_reason)
+            elif gone > max(received, 0):
+                told.append(loss_advice(topic, counts[3]))
+        self._before = now
+        return told
 
 
 @dataclass(frozen=True)
@@ -138,8 +195,6 @@ class NodeHealth:
     """Of the lifecycle."""
     failure: str = ""
     """Why the last configuration failed; empty where it did not."""
-    failing: bool = False
-    """Whether the last estimate ended in an error."""
     publishers: Mapping[str, int] = field(default_factory=dict)
     """How many of them each topic listens to: none is why nothing arrives."""
     lost: Mapping[str, int] = field(default_factory=dict)
@@ -148,6 +203,8 @@ class NodeHealth:
     """The slowest callback so far, by topic."""
     incompatible: Mapping[str, str] = field(default_factory=dict)
     """What to do about QoS that does not fit, by topic."""
+    troubles: Sequence[str] = ()
+    """What was wrong with topics of which nothing could be used since the last report, a sentence each."""
     advice: Sequence[str] = ()
     """What else a person ought to know and do, a sentence each."""
 
@@ -158,9 +215,10 @@ def diagnostic_status(name: str, health: NodeHealth, statistics: Statistics | No
     if statistics is not None:
         views = sum(scan.views for scan in statistics.scans.values())
         message = f"{health.state}, objects: {len(statistics.scans)}, views: {views}"
-    failure = statistics.last_failure if statistics is not None and health.failing else ""
-    warnings = [*health.incompatible.values(), failure, *health.advice]
-    worst = next(filter(None, warnings), "")
+    failures = [] if statistics is None else [scan.failure for scan in statistics.scans.values()]
+    worst = next(
+        filter(None, [*health.incompatible.values(), *failures, *health.troubles, *health.advice]), ""
+    )
     if worst:
         level, message = DiagnosticStatus.WARN, worst
     if health.failure:

@@ -69,7 +69,8 @@ def _refuse(problem: str) -> int:
 
 def _run(node: ScanNode, wait_for_signal: Callable[[], None]) -> bool:
     """Execute the node's callbacks until a signal comes; returns whether nothing of it runs any more."""
-    executor = MultiThreadedExecutor(num_threads=2)  # one may wait for an estimate
+    # One may wait for an estimate that a client asked for, another for those before a transition.
+    executor = MultiThreadedExecutor(num_threads=3)
     executor.add_node(node)
     executor.create_task(node.autostart)
     stopping = threading.Event()

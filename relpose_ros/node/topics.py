@@ -16,6 +16,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from visualization_msgs.msg import MarkerArray
 
+from relpose_ros.errors import RelPoseError
 from relpose_ros.msg import ObjectView, ScanEstimate
 from relpose_ros.node.reports import Throttle, loss_advice, qos_advice
 
@@ -70,6 +71,26 @@ OVERRIDABLE_BUT_RELIABILITY = QoSOverridingOptions(
 )
 
 
+class TopicError(RelPoseError):
+    """Names of topics that cannot be as they are remapped."""
+
+
+def require_topics_of_their_own(node: Node, transports: Collection[str]) -> None:
+    """Refuse names of which two are remapped to one: a topic has one type, and all of these have another.
+
+    Raises:
+        TopicError: Two are.
+    """
+    names = [name for _, name, _, transport in INPUTS if not transport or transport in transports]
+    by_topic: dict[str, str] = {}
+    for name in (*names, *(name for name, _ in OUTPUTS)):
+        topic = node.resolve_topic_name(name)
+        if topic in by_topic:
+            text = f"{by_topic[topic]} and {name} are both remapped to {topic}, where one type alone can be: "
+            raise TopicError(f"{text}give each a topic of its own.")
+        by_topic[topic] = name
+
+
 class IncompatibleQos:
     """Topics whose other end asks for, or offers, what this node does not."""
 
@@ -115,6 +136,8 @@ class Inputs:
         """By topic, how many there are."""
         self.lost: dict[str, int] = {}
         """By topic, messages that never arrived."""
+        self.of_other_types: list[tuple[str, str, str, str, str]] = []
+        """What `type_advice` takes, of topics on which another type is published than is read."""
         self._node = node
         self._incompatible = incompatible
         self._overrides = overrides
@@ -148,19 +171,23 @@ class Inputs:
         """Subscribe to nothing any more, and forget what was counted."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
-        self._subscriptions = []
+        self._subscriptions, self.of_other_types = [], []
         self.publishers.clear()
         self.lost.clear()
 
     def follow_publishers(self) -> None:
         """Ask for reliable delivery where every publisher offers it, and for best effort elsewhere."""
+        mistyped = []
         for k, subscription in enumerate(self._subscriptions):
-            topic = subscription.topic_name
+            topic, wanted_type = subscription.topic_name, _type_name(subscription.msg_type)
+            publishers = self._node.get_publishers_info_by_topic(topic)
+            for carried in sorted({each.topic_type for each in publishers} - {wanted_type}):
+                names = {self._node.resolve_topic_name(name): name for _, name, _, _ in INPUTS}
+                instead = next((name for _, name, type_, _ in INPUTS if _type_name(type_) == carried), "")
+                mistyped.append((topic, names[topic], carried, wanted_type, instead))
             if not self._adapts(topic):
                 continue
-            offered = {
-                each.qos_profile.reliability for each in self._node.get_publishers_info_by_topic(topic)
-            }
+            offered = {each.qos_profile.reliability for each in publishers}
             best_effort = ReliabilityPolicy.BEST_EFFORT in offered
             wanted = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
             if wanted != subscription.qos_profile.reliability:
@@ -168,6 +195,7 @@ class Inputs:
                 why = "a publisher is" if best_effort else "every publisher is"
                 now = wanted.name.lower().replace("_", " ")
                 self._node.get_logger().info(f"{topic} is subscribed {now} from now on, as {why}.")
+        self.of_other_types = mistyped
 
     def _subscribe(
         self, message_type: Any, name: str, callback: Callable[[Any], None], reliability: ReliabilityPolicy
@@ -220,3 +248,8 @@ class Inputs:
             line = self._loss_throttle.pass_on(topic, loss_advice(topic, self.lost[topic]))
             if line is not None:
                 self._node.get_logger().warning(line)
+
+
+def _type_name(message_type: Any) -> str:
+    """As it is on the graph: sensor_msgs/msg/Image."""
+    return f"{message_type.__module__.partition('.')[0]}/msg/{message_type.__name__}"

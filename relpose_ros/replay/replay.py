@@ -48,8 +48,8 @@ ESTIMATES_FOLDER, SCAN_FILE, REPORT_FILE = "estimates", "scan.json", "report.htm
 SHOWN_REASONS = 6
 """Kinds of rejected messages that are told apart at the end."""
 WAITED = (
-    "before the bag ended or more later pictures came than pairing_queue lets wait: record both with one "
-    "stamp, or raise that parameter"
+    "and frame_id before the bag ended or more later pictures came than pairing_queue lets wait: record both "
+    "with one stamp and frame_id, or raise that parameter"
 )
 
 

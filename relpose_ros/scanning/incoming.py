@@ -40,8 +40,12 @@ gigabytes."""
 MAX_FULL_SIDE = 2**16
 """Pixels: a larger full image is garbage."""
 
-SHORTEST_FOCAL = 0.05
-"""Of a focal length, in sides of the full image: no lens looks so wide, and a matrix in other units does."""
+SHORTEST_FOCAL, LONGEST_FOCAL = 0.05, 1000.0
+"""Of a focal length, in sides of the full image: no lens looks so wide or so narrowly, and a matrix in other
+units does."""
+
+FURTHEST_CENTRE = 10.0
+"""Of a principal point, in sides of the full image from its corner: of a crop it may lie outside."""
 
 QUATERNION_TOLERANCE = 0.01
 """How far from 1 a quaternion's length may be: rounded, not garbage."""
@@ -220,8 +224,8 @@ def robot_pose(message: Any, source: Source, deviations: tuple[float, float]) ->
     """
     if not source.frame_id:
         raise source.rejection("frame_id is empty: it names the robot's frame in which the pose is")
-    stated = getattr(message.pose, "covariance", None)
-    pose = message.pose if stated is None else message.pose.pose
+    given = getattr(message.pose, "covariance", None)
+    pose = message.pose if given is None else message.pose.pose
     p, q = pose.position, pose.orientation
     position, quaternion = np.array([p.x, p.y, p.z], float), np.array([q.x, q.y, q.z, q.w], float)
     if not np.isfinite(position).all():
@@ -230,16 +234,18 @@ def robot_pose(message: Any, source: Source, deviations: tuple[float, float]) ->
     if not abs(length - 1) < QUATERNION_TOLERANCE:  # nan is refused too
         text = f"the orientation {quaternion.tolist()} has length {length:.3g}: a rotation's quaternion has 1"
         raise source.rejection(text)
-    covariance = np.zeros((6, 6)) if stated is None else np.array(stated, float).reshape(6, 6)
+    covariance = np.zeros((6, 6)) if given is None else np.array(given, float).reshape(6, 6)
     if not np.isfinite(covariance).all():
         raise source.rejection("the covariance holds what is no number")
     covariance = (covariance + covariance.T) / 2
-    if not covariance.any():
+    stated = bool(covariance.any())
+    if not stated:
         covariance = np.diag(np.repeat(np.square(deviations), 3))
     elif float(np.linalg.eigvalsh(covariance)[0]) < -1e-9 * float(np.abs(covariance).max()):
         text = f"the covariance with the diagonal {np.diag(covariance).tolist()} is none: it has a negative"
         raise source.rejection(f"{text} eigenvalue; leave it all zero where it is unknown")
-    return RobotPose(source.frame_id, so3.from_quaternion_xyzw(quaternion), position, covariance)
+    rotation = so3.from_quaternion_xyzw(quaternion)
+    return RobotPose(source.frame_id, rotation, position, covariance, stated)
 
 
 def _view(
@@ -358,8 +364,11 @@ def _intrinsics(k: Any, size: tuple[int, int], source: Source) -> Intrinsics | N
     fx, fy, cx, cy = (float(matrix[index]) for index in (0, 4, 2, 5))
     if fx <= 0 or fy <= 0:
         raise source.rejection(f"the focal length in the intrinsic matrix is {fx}, {fy}: it must be positive")
-    if min(fx, fy) < SHORTEST_FOCAL * max(size):
+    if not SHORTEST_FOCAL <= min(fx, fy) / max(size) <= max(fx, fy) / max(size) <= LONGEST_FOCAL:
         text = f"the focal length in the intrinsic matrix is {fx}, {fy} for {_size_text(size)} pixels"
+        raise source.rejection(f"{text}: it must be in pixels")
+    if max(abs(cx), abs(cy)) > FURTHEST_CENTRE * max(size):
+        text = f"the principal point in the intrinsic matrix is {cx}, {cy} for {_size_text(size)} pixels"
         raise source.rejection(f"{text}: it must be in pixels")
     # ROS puts (0, 0) at the first pixel's centre, we at its outer corner.
     return Intrinsics(fx, fy, cx + 0.5, cy + 0.5)

@@ -34,7 +34,7 @@ class RobotPoses:
         self._entries: OrderedDict[int, _Entry] = OrderedDict()
 
     def put(self, source: Source, pose: RobotPose, held: Collection[int]) -> tuple[bool, list[Source]]:
-        """Keep a pose, the newer one of a stamp.
+        """Keep a pose, the newer one of a stamp; but none without a covariance instead of one with it.
 
         Args:
             source: Where it came from, and its stamp.
@@ -45,7 +45,7 @@ class RobotPoses:
             Whether it is news, and the source of the one that had to go though no view ever had its stamp.
         """
         old = self._entries.get(source.stamp_ns)
-        if old is not None and _same(old.pose, pose):
+        if old is not None and (_same(old.pose, pose) or old.pose.stated > pose.stated):
             return False, []
         self._entries[source.stamp_ns] = _Entry(source, pose, old is not None and old.claimed)
         if len(self._entries) <= KEPT + len(held):

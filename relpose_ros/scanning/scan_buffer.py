@@ -92,6 +92,11 @@ class ScanBuffer:
         self._epoch = 0
 
     @property
+    def epoch(self) -> int:
+        """Counts how often views that were taken had to go for another reason than the keep policy."""
+        return self._epoch
+
+    @property
     def views(self) -> tuple[View, ...]:
         """The views held, oldest first, without those whose place is not decided yet."""
         return tuple(self._views)

@@ -109,6 +109,8 @@ class ScanStatistics:
     """Views i and j of the last estimate's least certain pair; None before the first."""
     weakest_probability: float | None
     """Probability that this pair is within 15 degrees of its strongest mode; None before the first."""
+    failure: str = ""
+    """Why the latest estimate failed, a sentence; empty where it did not."""
     declined: int = 0
     """Views, among those dropped, that the keep policy never gave a place."""
 
@@ -128,6 +130,8 @@ class Statistics:
     """Images that found no camera info of their stamp before `ScanSettings.pairing_queue` later ones came."""
     infos_alone: int
     """Camera infos that found no image in time."""
+    frames_apart: tuple[str, str] | None
+    """The frames of the latest image and camera info of one stamp, where they differ and none met since."""
     images_missing: bool
     """Whether most of the latest camera infos found none."""
     failed: int
@@ -210,18 +214,19 @@ class Scanner:
             return work or bool(self._taken_back)
 
     def estimate_pending(self) -> list[Result]:
-        """Estimate each scan that changed since its last estimate and has two views or more.
+        """Estimate a scan that changed since its last estimate and has two views or more.
 
-        What has to be taken back of others is among the results, in the order in which it happened.
+        Of several the one that was seen least lately. What has to be taken back of others is among the
+        results, in the order in which it happened.
 
-        All views that came meanwhile are taken together. Returns after one round: call it again while
-        ``pending()``. A result whose scan was reset while it was made is dropped; so is a trial of a
-        further view (keep policy "spread") that the scan does not take.
+        All views that came meanwhile are taken together. Call it again while ``pending()``. A result whose
+        scan was reset while it was made is dropped; so is a trial of a further view (keep policy "spread")
+        that the scan does not take.
         """
         with self._estimating:
             with self._state:
                 changed = [state for state in self._scans.values() if state.buffer.has_work()]
-            return self._estimate(changed)
+            return self._estimate(changed[:1])
 
     def estimate_now(self, object_id: str | None = None) -> list[Result]:
         """Estimate a scan, or all, changed or not. No result has cameras where none has two views."""
@@ -231,6 +236,19 @@ class Scanner:
                 for state in chosen:
                     state.buffer.require_work()
             return self._estimate(chosen)
+
+    def stands(self, result: Result) -> bool:
+        """Whether a result holds still, and no view of its scan was forgotten since."""
+        with self._state:
+            state = self._scans.get(result.scan.object_id)
+            if state is None or state.estimate is not result.estimate:
+                return False
+            return state.epoch == state.buffer.epoch
+
+    def objects(self) -> list[str]:
+        """The objects of which views are held, the one seen last at the end."""
+        with self._state:
+            return list(self._scans)
 
     def reset(self, reason: str, object_id: str | None = None) -> int:
         """Forget the views of one object, or of all, and what waits for its counterpart.
@@ -298,6 +316,7 @@ class Scanner:
         """A snapshot for diagnostics."""
         with self._receiving:
             waiting, images_alone = self._pairing.waiting(), self._pairing.images_alone
+            frames_apart = self._pairing.frames_apart
             since = self._unpaired_since
             self._infos.settle(self._clock())
             infos_alone, images_missing = self._infos.alone, self._infos.most_are_alone()
@@ -310,6 +329,7 @@ class Scanner:
                 scans={object_id: state.snapshot() for object_id, state in self._scans.items()},
                 waiting=waiting,
                 images_alone=images_alone,
+                frames_apart=frames_apart,
                 unpaired_s=None if since is None else self._clock() - since,
                 infos_alone=infos_alone,
                 images_missing=images_missing,
@@ -430,7 +450,7 @@ class Scanner:
         views = len(state.buffer.views)
         self._take_back(state, state.buffer.views, "no view is left: another object needed the room")
         text = "The scan of %r with %d views is forgotten to make room: max_scans is %d."
-        _logger.info(text, oldest, views, self._settings.max_scans)
+        _logger.warning(text, oldest, views, self._settings.max_scans)
 
     def _take_back(self, state: _ScanState, views: tuple[View, ...], status: str) -> None:
         """Have it told that the last estimate of a scan holds no longer, if there is one."""
@@ -465,6 +485,8 @@ class Scanner:
         results: list[Result] = []
         for state in states:
             with self._state:
+                if self._scans.get(state.buffer.object_id) is not state:  # reset meanwhile
+                    continue
                 work, arrived = state.buffer.work(), state.arrived
                 if work is None:
                     continue
@@ -483,7 +505,7 @@ class Scanner:
                     if work.without is not None:  # a trial, of a failure that was told
                         continue
                     self._failed += 1
-                    self._last_failure = text
+                    self._last_failure = state.failure = text
                     # A sentence for the user needs no traceback, a defect does, once.
                     trace = not isinstance(err, RelPoseError) and repr(err) != self._last_error
                     self._last_error = repr(err)
@@ -493,7 +515,8 @@ class Scanner:
                 self._move_taken_back(results)
                 current = self._scans.get(scan.object_id) is state
                 if current and state.buffer.settle(work, estimate):
-                    state.estimates += 1
+                    state.estimates, state.failure = state.estimates + 1, ""
+                    state.epoch = state.buffer.epoch
                     state.latency_s = self._clock() - arrived
                     state.estimate = estimate
                     results.append(Result(scan, estimate))
@@ -561,6 +584,9 @@ class _ScanState:
     estimates: int = 0
     latency_s: float | None = None
     estimate: ScanEstimate | None = None
+    epoch: int = 0
+    """The buffer's, when that estimate was made."""
+    failure: str = ""
 
     def snapshot(self) -> ScanStatistics:
         pairs = () if self.estimate is None else self.estimate.pairs
@@ -573,5 +599,6 @@ class _ScanState:
             status="" if self.estimate is None else self.estimate.status,
             weakest_pair=None if weakest is None else (weakest.i, weakest.j),
             weakest_probability=None if weakest is None else weakest.probability_within_15_deg,
+            failure=self.failure,
             declined=self.buffer.declined,
         )

@@ -282,10 +282,13 @@ class ScanSettings:
         return cls.from_mapping(own)
 
 
+MEANT = "did you mean"
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """The known name that is nearest to a misspelt one, in brackets; empty where none is near."""
     nearest = get_close_matches(name, known, n=1)
-    return f" (did you mean {nearest[0]}?)" if nearest else ""
+    return f" ({MEANT} {nearest[0]}?)" if nearest else ""
 
 
 def _like_default(value: Any, default: Any) -> Any:

@@ -74,6 +74,20 @@ def test_the_heaviest_mode_is_not_the_highest(fisher_scene, cameras_around):
     assert math.degrees(so3.angle_between(told, broad)) < 2
 
 
+def test_how_far_the_poses_are_from_a_pair_is_told_of_its_modes_alone(fisher_scene, cameras_around):
+    """A pair that is sure of something else, and has a peak of a thousandth where the others put it."""
+    scene = fisher_scene(cameras_around(3, 0))
+    true, wrong = scene.relative(0, 1), so3.exp([0, 2.5, 0]) @ scene.relative(0, 1)
+    scene.mixtures[0, 1] = [(wrong, 0.0, 40.0), (true, -5.0, 200.0)]
+    for pair in ((0, 2), (1, 2)):
+        scene.mixtures[pair] = [(scene.relative(*pair), 0.0, 400.0)]
+    pairs, _, solution = told(scene)
+    assert math.degrees(so3.angle_between(solution[1], true)) < 1
+    assert len(pairs[0].modes) == 1
+    assert pairs[0].solution_angle == pytest.approx(2.5, abs=0.05)
+    assert pairs[1].solution_angle < 0.01
+
+
 def test_a_modes_covariance_is_that_of_its_core_and_the_total_one_holds_all(fisher_scene, cameras_around):
     """A sharp peak, a sixth of near misses ten degrees off, a twentieth that may be anywhere."""
     scene = fisher_scene(cameras_around(2, 0))

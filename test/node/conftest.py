@@ -421,9 +421,14 @@ def start_without_network(start: Callable[..., NodeProcess]) -> Callable[..., No
     """Starts nodes whose estimator only takes its time, and quickly, because they do without PyTorch."""
 
     def start_without_network(
-        *parameters: str, loading_s: float = 0.0, estimating_s: float = 0.0, files: Sequence[Path] = ()
+        *parameters: str,
+        loading_s: float = 0.0,
+        estimating_s: float = 0.0,
+        files: Sequence[Path] = (),
+        remapping: dict[str, str] | None = None,
     ) -> NodeProcess:
         given = [word for each in parameters for word in ("-p", each)]
+        given += [word for name, topic in (remapping or {}).items() for word in ("-r", f"{name}:={topic}")]
         given += [word for each in files for word in ("--params-file", str(each))]
         times = (str(loading_s), str(estimating_s))
         return start(*times, "--ros-args", *given, program=START_WITHOUT_NETWORK)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from relpose_ros.msg import ScanEstimate
@@ -119,6 +120,54 @@ def test_a_qos_override_that_cannot_be_is_told(
     assert "qos_overrides" in new_graph.diagnostics().message
     assert new_graph.state() == "unconfigured"
     assert new_graph.node.count_publishers("/scan_node/estimate") == 0, "what was made is released"
+    assert node.end() == 0
+
+
+@pytest.mark.parametrize(
+    ("remapping", "words"),
+    [
+        (
+            {"image": "/cam", "image/compressed": "/cam"},
+            "image and image/compressed are both remapped to /cam, where one type alone can be",
+        ),
+        (
+            {"object_view": "/scan_node/estimate"},
+            "object_view and ~/estimate are both remapped to /scan_node/estimate",
+        ),
+    ],
+)
+def test_two_inputs_on_one_topic_are_told(
+    remapping: dict[str, str], words: str, start_without_network: Callable[..., Any], new_graph: Any
+) -> None:
+    node = start_without_network(remapping=remapping)
+    node.wait_for("ERROR", words)
+    assert words in new_graph.diagnostics().message
+    assert new_graph.state() == "unconfigured"
+    assert node.end() == 0
+
+
+def test_a_transport_that_is_not_asked_for_takes_no_topic(start_without_network: Callable[..., Any]) -> None:
+    remapping = {"image": "/cam", "image/compressed": "/cam"}
+    node = start_without_network("image_transports:=[raw]", remapping=remapping)
+    node.wait_for("Waiting for views", "/cam")
+    assert node.end() == 0
+
+
+def test_diagnostics_go_on_while_a_transition_waits_for_an_estimate(
+    start_without_network: Callable[..., Any], new_graph: Any, make: Any
+) -> None:
+    node = start_without_network("diagnostics_period_s:=0.1", estimating_s=FOR_EVER_S)
+    node.wait_for("Waiting for views")
+    new_graph.publish("/object_view", *(make.object_view(10.0 + k, "mug") for k in range(2)))
+    node.wait_for("estimating")
+    client = new_graph.node.create_client(ChangeState, "/scan_node/change_state")
+    assert client.wait_for_service(60)
+    request = ChangeState.Request()
+    request.transition.id = Transition.TRANSITION_DEACTIVATE
+    answer = client.call_async(request)
+    for _ in range(20):
+        new_graph.diagnostics()
+    assert not answer.done()
     assert node.end() == 0
 
 

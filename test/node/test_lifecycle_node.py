@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from relpose_ros.msg import ObjectView
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 
 from relpose_ros.node.lifecycle_node import ScanNode
 
@@ -147,3 +149,55 @@ def test_camera_infos_without_images_are_told(
     new_graph.publish_until(lambda: new_graph.diagnostic("advice") is None, "its end", publish_both)
     assert "camera infos" not in new_graph.diagnostics().message
     assert node.end() == 0
+
+
+def test_a_topic_of_another_type_is_told(
+    start_without_network: Callable[..., Any], new_graph: Any, make: Any
+) -> None:
+    """The commonest mistake: a camera's compressed topic where its raw one is expected."""
+    node = start_without_network(OFTEN)
+    node.wait_for("Waiting for views")
+    other = new_graph.node.create_publisher(CompressedImage, IMAGE, QoSProfile(depth=1))
+    words = "/image carries sensor_msgs/msg/CompressedImage, and sensor_msgs/msg/Image is read there"
+    assert node.wait_for("WARN", words, "remap image/compressed to it")
+    assert words in new_graph.diagnostics().message
+    assert new_graph.node.destroy_publisher(other)
+    new_graph.wait_until(lambda: new_graph.diagnostic("advice") is None, "its end")
+
+
+def test_diagnostics_warn_while_nothing_that_comes_is_of_use(
+    start_without_network: Callable[..., Any], new_graph: Any, make: Any
+) -> None:
+    node = start_without_network(OFTEN)
+    node.wait_for("Waiting for views")
+    stamps = itertools.count(10)
+
+    def warned() -> bool:
+        view = make.object_view(float(next(stamps)), "mug")
+        view.image.encoding = "foo8"
+        new_graph.publish(OBJECT_VIEW, view)
+        status = new_graph.diagnostics()
+        return status.level == DiagnosticStatus.WARN and "foo8" in status.message
+
+    new_graph.wait_until(warned, "a warning")
+    new_graph.publish(OBJECT_VIEW, make.object_view(float(next(stamps)), "mug"))
+    new_graph.wait_until(lambda: new_graph.diagnostics().level == DiagnosticStatus.OK, "its end")
+
+
+def test_what_was_forgotten_meanwhile_is_not_told(monkeypatch: pytest.MonkeyPatch, domain: int) -> None:
+    """A service has answered that it is gone; only what takes it back goes out."""
+    context = rclpy.Context()
+    context.init(domain_id=domain)
+    node = ScanNode(context=context, enable_rosout=False)
+    try:
+        told: list[Any] = []
+        monkeypatch.setattr(node, "_publish", told.extend)
+        gone, back, stands = (
+            SimpleNamespace(estimate=SimpleNamespace(cameras=n)) for n in ((1, 2), (), (3,))
+        )
+        scanner: Any = SimpleNamespace(stands=lambda result: result is stands)
+        node._estimate(scanner, lambda: [gone, back, stands])  # type: ignore[list-item]
+        assert told == [back, stands]
+    finally:
+        node.destroy_node()
+        context.shutdown()

@@ -119,6 +119,14 @@ WRONG_OBJECT_VIEWS: list[tuple[dict[str, Any], str]] = [
     ({"k": (NAN, 0, 20, 0, 500, 16, 0, 0, 1)}, r"the intrinsic matrix holds what is no number: \[nan, 0.0,"),
     ({"k": (500, 0, 20, 0, 500, 16, 0, 0, float("inf"))}, "no number"),
     ({"k": (500, 0, 20, 0, 0, 16, 0, 0, 1)}, "focal length in the intrinsic matrix is 500.0, 0.0"),
+    (
+        {"k": (500, 0, 20, 0, 1e12, 16, 0, 0, 1)},
+        "focal length .* is 500.0, 1000000000000.0 for 40 x 32 pixels",
+    ),
+    (
+        {"k": (500, 0, -1e9, 0, 500, 16, 0, 0, 1)},
+        "principal point .* is -1000000000.0, 16.0 for 40 x 32 pixels",
+    ),
     ({"k": (-500, 0, 20, 0, 500, 16, 0, 0, 1)}, "must be positive"),
     ({"k": (1.2, 0, 0.5, 0, 1.2, 0.5, 0, 0, 1)}, "is 1.2, 1.2 for 40 x 32 pixels: it must be in pixels"),
     ({"frame_id": "x" * 129}, r"frame_id has 129 characters, more than 128: 'x{40}'\.\.\."),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -43,6 +44,47 @@ def test_cameras_are_not_mixed() -> None:
     assert pairs(pairing, "image", 1, camera="left") == []
     assert pairs(pairing, "camera_info", 1, camera="right") == []
     assert len(pairs(pairing, "camera_info", 1, camera="left")) == 1
+
+
+def of_frame(stamp: int, frame: str) -> Arrival:
+    return Arrival((frame, stamp), Source("topic", stamp, frame))
+
+
+def frames(pairing: Pairing, kind: Any, stamp: int, frame: str) -> list[tuple[str, str]]:
+    found = pairing.add(kind, of_frame(stamp, frame), "")
+    return [(pair.image.source.frame_id, pair.info.source.frame_id) for pair in found]
+
+
+def test_cameras_of_one_stamp_are_told_apart_by_their_frames() -> None:
+    """As of a stereo camera whose halves publish on the same two topics."""
+    pairing = Pairing(5, 1000)
+    assert frames(pairing, "image", 1, "left") == []
+    assert frames(pairing, "camera_info", 1, "right") == []
+    assert pairing.frames_apart == ("left", "right")
+    assert frames(pairing, "image", 1, "right") == [("right", "right")]
+    assert frames(pairing, "camera_info", 1, "left") == [("left", "left")]
+    assert pairing.frames_apart is None
+    assert pairing.waiting() == 0
+
+
+@pytest.mark.parametrize(("image", "info"), [("", "camera"), ("camera", ""), ("/camera", "camera")])
+@pytest.mark.parametrize("first", ["image", "camera_info"])
+def test_a_frame_that_is_not_named_is_any(image: str, info: str, first: str) -> None:
+    pairing = Pairing(5, 1000)
+    halves = [("image", image), ("camera_info", info)]
+    (one, other) = halves if first == "image" else halves[::-1]
+    assert frames(pairing, one[0], 1, one[1]) == []
+    assert frames(pairing, other[0], 1, other[1]) == [(image, info)]
+
+
+def test_images_whose_infos_are_of_another_frame_wait_and_it_is_noted() -> None:
+    pairing = Pairing(2, 1000)
+    for stamp in range(4):
+        assert frames(pairing, "camera_info", stamp, "info") == frames(pairing, "image", stamp, "image") == []
+    assert pairing.frames_apart == ("image", "info")
+    assert (pairing.waiting(), pairing.images_alone) == (2, 2)
+    pairing.clear()
+    assert pairing.frames_apart is None
 
 
 def test_what_waits_longest_goes_when_there_is_too_much() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,15 @@ def test_each_view_has_the_pose_of_its_stamp() -> None:
         assert put(poses, stamp, float(stamp)) == (True, [])
     found = poses.of([view(3), view(9), view(1)])
     assert [None if each is None else each.position[0] for each in found] == [3.0, None, 1.0]
+
+
+def test_a_pose_with_a_covariance_stays_where_one_without_comes() -> None:
+    source, stated, plain = Source("camera_pose", 1, "base"), pose(1.0), replace(pose(2.0), stated=False)
+    for order, news in (((stated, plain), False), ((plain, stated), True)):
+        poses = RobotPoses()
+        assert poses.put(source, order[0], ())[0]
+        assert poses.put(source, order[1], ())[0] is news
+        assert poses.of([view(1)]) == (stated,)
 
 
 def test_no_pose_at_all_is_nothing() -> None:

@@ -405,6 +405,67 @@ def test_what_is_taken_back_comes_in_the_order_in_which_it_happened(
     assert told == [("mug", [1, 2], 2), ("mug", [1, 2], 0), ("can", [1, 2], 2), ("mug", [3, 4], 2)]
 
 
+def test_objects_are_estimated_one_by_one_the_least_lately_seen_first(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    """So that what is told of one need not wait for all the others."""
+    scanner = Scanner(circle_estimator(), ScanSettings())
+    for object_id in ("mug", "can", "mug"):
+        send_views(scanner, bag_messages, *((1, 2) if object_id != "mug" else ()), object_id=object_id)
+    send_views(scanner, bag_messages, 1, 2, object_id="jar")
+    send_views(scanner, bag_messages, 3, object_id="can")
+    assert [[each.scan.object_id for each in scanner.estimate_pending()] for _ in range(3)] == [
+        ["jar"],
+        ["can"],
+        [],
+    ]
+    assert scanner.objects() == ["jar", "can"]
+
+
+@pytest.mark.parametrize("what", ["reset", "drop", "jump", "more", "other"])
+def test_a_result_stands_until_its_views_are_forgotten(
+    bag_messages: Any, circle_estimator: Callable[..., Any], what: str
+) -> None:
+    scanner = Scanner(circle_estimator(), ScanSettings(keep="latest", max_views=3))
+    send_views(scanner, bag_messages, 10, 11, 12)
+    (result,) = scanner.estimate_pending()
+    assert scanner.stands(result)
+    if what == "reset":
+        scanner.reset("a test asked for it")
+    elif what == "drop":
+        scanner.drop_last_view()
+    elif what == "jump":
+        send_views(scanner, bag_messages, 1, 2)
+    elif what == "more":  # a view let go by the keep policy
+        send_views(scanner, bag_messages, 13)
+    else:
+        send_views(scanner, bag_messages, 1, 2, object_id="can")
+        scanner.drop_last_view("can")
+    assert scanner.stands(result) is (what in {"more", "other"})
+    if what == "more":
+        (newer,) = scanner.estimate_pending()
+        assert scanner.stands(newer)
+        assert not scanner.stands(result)
+
+
+def test_what_was_reset_meanwhile_is_not_estimated(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    inner = circle_estimator()
+    estimated = []
+
+    def estimate(scan: Scan) -> ScanEstimate:
+        estimated.append(scan.object_id)
+        scanner.reset("a test asked for it")
+        return inner.estimate(scan)
+
+    scanner = Scanner(SimpleNamespace(estimate=estimate), ScanSettings())
+    for object_id in ("mug", "can", "jar"):
+        send_views(scanner, bag_messages, 1, 2, object_id=object_id)
+    assert scanner.estimate_now() == []
+    assert estimated == ["mug"]
+
+
 def test_an_estimate_may_be_asked_for(bag_messages: Any, circle_estimator: Callable[..., Any]) -> None:
     scanner = Scanner(circle_estimator(), ScanSettings())
     send_views(scanner, bag_messages, 1)
@@ -544,9 +605,25 @@ def test_an_estimator_that_fails_does_not_end_the_scan(
     assert "Traceback" not in caplog.text
     assert scanner.statistics().failed == 2
     assert "two of the views" in scanner.statistics().last_failure
+    assert "two of the views" in scanner.statistics().scans["mug"].failure
     send_views(scanner, bag_messages, 4)
     (result,) = drain(scanner)
     assert stamps_of(result.scan) == [1, 2, 3, 4]
+    assert scanner.statistics().scans["mug"].failure == ""
+
+
+def test_a_scan_whose_estimates_all_fail_is_told_all_the_time(bag_messages: Any) -> None:
+    """Those without one or the other view, of which nothing is logged, too."""
+
+    def estimate(scan: Scan) -> ScanEstimate:
+        raise RelPoseError("no view of it will do")
+
+    scanner = Scanner(SimpleNamespace(estimate=estimate), ScanSettings())
+    for stamp in range(1, 7):
+        send_views(scanner, bag_messages, stamp)
+        while scanner.pending():
+            scanner.estimate_pending()
+            assert "no view of it will do" in scanner.statistics().scans["mug"].failure
 
 
 def test_many_threads_lose_no_view(bag_messages: Any, circle_estimator: Callable[..., Any]) -> None:
