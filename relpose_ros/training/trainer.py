@@ -164,7 +164,7 @@ class Trainer:
     ) -> None:
         """Train until the run is finished or the time is up, then write a checkpoint and the weights.
 
-        SIGINT (Ctrl-C) and SIGTERM end it after the step at hand; a second one ends it at once.
+        SIGINT (Ctrl-C) and SIGTERM end it after the step at hand; a second SIGINT ends it at once.
 
         Args:
             budget_s: Wall-clock seconds, None for no limit.
@@ -444,7 +444,10 @@ class Trainer:
 
 
 class _StopRequest:
-    """Whether SIGINT or SIGTERM came while it is entered. The second of them does what it always did."""
+    """Whether SIGINT or SIGTERM came while it is entered. A second SIGINT does what it always did.
+
+    A second SIGTERM does not: torchrun sends one after the terminal's SIGINT, and kills what lingers itself.
+    """
 
     def __init__(self) -> None:
         self.asked = False
@@ -460,9 +463,10 @@ class _StopRequest:
             signal.signal(number, handler)
         self._before = {}
 
-    def _ask(self, _number: int, _frame: object) -> None:
+    def _ask(self, number: int, _frame: object) -> None:
         self.asked = True
-        self.__exit__()
+        if number == signal.SIGINT:
+            signal.signal(number, self._before[number])
 
 
 def _own_device(device: str) -> torch.device:

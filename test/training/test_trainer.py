@@ -91,21 +91,25 @@ def test_time_that_is_up_leaves_a_checkpoint_and_weights(tmp_path, scans):
     assert metadata["images_seen"] == "0"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_run_after_its_step_and_saves_it(tmp_path, scans, monkeypatch, number):
+@pytest.mark.parametrize(
+    "numbers",
+    [(signal.SIGINT,), (signal.SIGTERM,), (signal.SIGINT, signal.SIGTERM), (signal.SIGTERM, signal.SIGTERM)],
+)
+def test_a_signal_ends_a_run_after_its_step_and_saves_it(tmp_path, scans, monkeypatch, numbers):
     run = Trainer(SETTINGS, tmp_path, scans)
     step = run.train_step
 
     def interrupted():
         if run.step == 2:
-            signal.raise_signal(number)
+            for number in numbers:
+                signal.raise_signal(number)
         return step()
 
     monkeypatch.setattr(run, "train_step", interrupted)
-    before = signal.getsignal(number)
+    before = signal.getsignal(numbers[0])
     with pytest.raises(KeyboardInterrupt):
         run.run(progress=False)
-    assert signal.getsignal(number) is before
+    assert signal.getsignal(numbers[0]) is before
     assert Trainer(SETTINGS, tmp_path, scans).step == 3
 
 
