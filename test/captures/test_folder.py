@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -59,6 +61,27 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert capture.view(0, masked=False).mask is None
 
 
+def test_a_mask_with_soft_edges_is_cut_in_the_middle(tmp_path: Path) -> None:
+    capture = save_capture(tmp_path, [frame()])
+    grey = np.tile(np.arange(64, dtype=np.uint8) * 4, (48, 1))
+    assert cv2.imwrite(str(tmp_path / "masks/000.png"), grey)
+    mask = capture.view(0).mask
+    assert mask is not None
+    np.testing.assert_array_equal(mask, np.tile(np.arange(64) >= 32, (48, 1)))
+
+
+def test_an_orientation_tag_does_not_turn_a_photo(tmp_path: Path) -> None:
+    """The listing counts the pixels as they are stored."""
+    capture = save_capture(tmp_path, [frame()])
+    plain = capture.view(0).image
+    file = tmp_path / "images/000.jpg"
+    data = file.read_bytes()
+    exif = b"Exif\0\0II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, 6, 0, 0)
+    file.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:])
+    assert cv2.imread(str(file)).shape == (64, 48, 3), "OpenCV by itself follows the tag"
+    np.testing.assert_array_equal(capture.view(0).image, plain)
+
+
 def test_a_folder_is_not_written_over(tmp_path: Path) -> None:
     save_capture(tmp_path, [frame()])
     with pytest.raises(CaptureError, match="holds a capture already"):
@@ -75,6 +98,9 @@ def test_a_crop_is_no_frame(tmp_path: Path) -> None:
     ("change", "sentence"),
     [
         ({"box": [0, 0, 65, 48]}, "not inside the image of 64 x 48"),
+        ({"box": [-1, 0, 64, 48]}, "not inside the image of 64 x 48"),
+        ({"box": [0, -1, 64, 48]}, "not inside the image of 64 x 48"),
+        ({"box": [0, 0, 64, 49]}, "not inside the image of 64 x 48"),
         ({"box": [5, 5, 5, 9]}, "is empty"),
         ({"box": [5, 5, 9]}, "4 finite numbers"),
         ({"box": ["a", 5, 9, 9]}, "4 finite numbers"),
@@ -83,6 +109,7 @@ def test_a_crop_is_no_frame(tmp_path: Path) -> None:
         ({"width": "64"}, "a finite number is needed"),
         ({"fx": float("nan")}, "a finite number is needed"),
         ({"fx": -1}, "must be positive"),
+        ({"fy": 0}, "must be positive"),
         ({"cy": None}, "not all of fx, fy, cx, cy"),
         ({"file": "images/009.jpg"}, "not in the folder"),
         ({"file": "../../etc/passwd"}, "outside the capture's folder"),

@@ -71,6 +71,10 @@ def test_one_camera_turned_by_an_angle_shows_it_in_its_pairs_alone(seed, count, 
     np.testing.assert_allclose(errors[wrong], np.degrees(angle), atol=1e-5)
 
 
+def test_the_scene_s_scale_is_the_way_to_the_furthest_camera():
+    assert metrics.scene_scale([[0.0, 0, 0], [0, 0, 0], [3, 0, 0]]) == pytest.approx(2)
+
+
 def test_centre_errors_by_hand():
     # Four cameras on a square; the estimate has the fourth one half a side further out.
     truth = np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]])

@@ -321,4 +321,16 @@ def test_errors_are_as_large_as_the_information_says(point_scene):
             own = slice(6 * camera - 6, 6 * camera - 3)
             error = so3.log(scene.rotations[camera] @ found.rotations[camera].T)
             squares.append(error @ np.linalg.solve(covariance[own, own], error))
-    assert 1.5 < np.mean(squares) < 5
+    assert 2 < np.mean(squares) < 4
+
+
+def test_features_half_as_exact_tell_a_quarter_but_none_is_more_exact_than_a_third_of_a_pixel(point_scene):
+    scene = point_scene.ring(ANGLES)
+    told = {}
+    for noise in (0.05, 0.1, 0.5, 1.0):
+        features = scene.features(noise=noise)
+        found = refine(*perturbed(scene), features, geometries(scene, features))
+        told[noise] = np.trace(found.information)
+    assert told[0.05] == pytest.approx(told[0.1], rel=0.1)
+    # Larger errors weigh less in the robust loss, too.
+    assert 4 < told[0.5] / told[1.0] < 8

@@ -13,13 +13,15 @@ import torch
 
 from relpose_ros.estimates import Evidence, Verdict
 from relpose_ros.geometry import cameras, so3
-from relpose_ros.inference import bundle_adjustment, matches
+from relpose_ros.inference import bundle_adjustment, camera_positions, matches, refined_poses, verdict
 from relpose_ros.inference.bundle_adjustment import Refined
 from relpose_ros.inference.calibration import Calibration
-from relpose_ros.inference.estimator import OWN_THREADS, Estimator, ScanError
+from relpose_ros.inference.estimator import OWN_THREADS, Estimator, ScanError, _baselines
 from relpose_ros.inference.evidence import EvidenceError, EvidenceSettings
-from relpose_ros.inference.outlines import find_outline, sighted_translations
+from relpose_ros.inference.matches import NOTHING, TwoViewGeometry
+from relpose_ros.inference.outlines import find_outline, sighted_translations, sightlines
 from relpose_ros.inference.predictions import about_the_object, predicted_translations, regressed_poses
+from relpose_ros.inference.two_view_poses import RelativePose
 from relpose_ros.network.checkpoint import NetworkFileError, random_network, write_network
 from relpose_ros.network.crops import crop_square
 from relpose_ros.network.features import SceneFeatures
@@ -416,6 +418,92 @@ def test_a_refinement_that_contradicts_the_pairs_is_not_taken(network, ball, of_
     refused = estimated(network, ball, use="refine")
     assert len(calls) == 1
     assert numbers(refused) == numbers(of_ball(use="pairs"))
+
+
+def test_a_camera_that_the_refinement_leaves_out_is_placed_anew_from_where_it_was(network, ball, monkeypatch):
+    """By its directions to the others, once, and by none between cameras whose points tell them better."""
+    placed = []
+
+    def without_the_last(rotations, translations, *rest):
+        return Refined(rotations, translations, ((0, 1),), 5.0, 0.1, np.eye(12))
+
+    def place(centres, joint, baselines):
+        placed.append((centres.copy(), [(each.i, each.j) for each in baselines]))
+        return camera_positions.place(centres, joint, baselines)
+
+    monkeypatch.setattr(bundle_adjustment, "refine", without_the_last)
+    monkeypatch.setattr("relpose_ros.inference.estimator.place", place)
+    estimated(network, ball, use="refine")
+    (before, among_all), (after, left) = placed
+    assert among_all == [(0, 1), (0, 2), (1, 2)]
+    assert left == [(0, 2), (1, 2)]
+    np.testing.assert_array_equal(after[2], before[2])
+
+
+def test_one_guessed_focal_length_is_told_to_all_that_it_makes_uncertain(network, ball, monkeypatch):
+    asked = {}
+
+    def as_it_was(rotations, translations, *rest):
+        return Refined(rotations, translations, ((0, 1, 2),), 5.0, 0.1, np.eye(18))
+
+    def settle(*arguments, guessed):
+        asked["settle"] = guessed
+        return refined_poses.settle(*arguments, guessed=guessed)
+
+    def judge(pairs, covariances, calibrated, *, guessed, seen):
+        asked.update(covariances=covariances, calibrated=calibrated, judge=guessed, seen=seen)
+        return verdict.judge(pairs, covariances, calibrated, guessed=guessed, seen=seen)
+
+    monkeypatch.setattr(bundle_adjustment, "refine", as_it_was)
+    monkeypatch.setattr("relpose_ros.inference.estimator.settle", settle)
+    monkeypatch.setattr("relpose_ros.inference.estimator.judge", judge)
+    views = (*ball.views[:2], replace(ball.views[2], intrinsics=None))
+    estimate = estimated(network, Scan("ball", views), use="refine")
+    assert (asked["settle"], asked["judge"], asked["calibrated"]) == (True, True, True)
+    np.testing.assert_array_equal(asked["covariances"], [camera.covariance for camera in estimate.cameras])
+    np.testing.assert_array_equal(asked["seen"], sightlines([find_outline(view) for view in views]))
+    estimated(network, ball, use="refine")
+    assert (asked["settle"], asked["judge"]) == (False, False)
+
+
+def test_how_the_pairs_agree_is_said_of_the_refined_poses(network, ball, monkeypatch):
+    def turned(rotations, translations, *rest):
+        moved = np.concatenate([rotations[:1], so3.exp([0, 0.01, 0]) @ rotations[1:]])
+        return Refined(moved, translations, ((0, 1, 2),), 5.0, 0.1, np.eye(18))
+
+    def angles(estimate):
+        """Between each pair's first mode and the poses."""
+        found = np.stack([camera.object_from_camera.T for camera in estimate.cameras])
+        return [
+            so3.angle_between(pair.modes[0].camera_j_from_camera_i, found[pair.j] @ found[pair.i].T)
+            for pair in estimate.pairs
+        ]
+
+    plain = estimated(network, ball, use="pairs")
+    monkeypatch.setattr(bundle_adjustment, "refine", turned)
+    refined = estimated(network, ball, use="refine")
+    assert np.abs(np.subtract(angles(refined), angles(plain))).max() > 1e-3, "it was taken"
+    np.testing.assert_allclose([pair.solution_angle for pair in refined.pairs], angles(refined), atol=1e-5)
+    assert refined.score < plain.score
+
+
+def test_directions_between_cameras_come_from_matches_that_agree_and_turn_with_the_second_camera():
+    rotations = so3.exp(np.radians([[0.0, 0, 0], [0, 20, 0], [0, 40, 0]]))
+    covariances = np.stack([1e-4 * (camera + 1) * np.eye(6) for camera in range(3)])
+
+    def geometry(i, j, off_deg=0.0, probability=0.9):
+        turn = so3.exp(np.radians([0, off_deg, 0])) @ rotations[j] @ rotations[i].T
+        pose = RelativePose(turn, np.array([1.0, 0, 0]), np.zeros((3, 3)), np.zeros((3, 3)), 1.0)
+        return TwoViewGeometry((pose,), np.zeros((0, 2), np.int64), probability)
+
+    agreeing = {(0, 1): geometry(0, 1), (1, 2): geometry(1, 2)}
+    first, second = _baselines({**agreeing, (0, 2): NOTHING}, rotations, covariances)
+    for found, j in ((first, 1), (second, 2)):
+        assert found.j == j
+        np.testing.assert_allclose(found.direction, -rotations[j].T @ [1, 0, 0], atol=1e-12)
+        assert np.trace(found.covariance) == pytest.approx(2e-4 * (j + 1))
+    for doubtful in (geometry(0, 1, off_deg=15), geometry(0, 1, probability=0.4)):
+        assert _baselines({(0, 1): doubtful}, rotations, covariances) == []
 
 
 def test_geometry_alone(network, ball, of_ball, ball_errors):

@@ -43,6 +43,12 @@ def test_the_outline_is_the_box_as_the_camera_sees_it(textured):
     assert (bent.sides > 1.02 * outline.sides).all()
 
 
+@pytest.mark.parametrize("box", [(1, 0, 200, 160), (0, 1, 200, 160), (0, 0, 199, 160), (0, 0, 200, 159)])
+def test_a_box_that_leaves_a_strip_of_the_picture_tells(textured, box):
+    """As of an object that the picture cuts off on three sides."""
+    assert find_outline(replace(textured(0), box=BoundingBox(*box))) is not None
+
+
 def test_without_intrinsics_a_box_still_says_which_way_the_object_is(textured):
     view = replace(textured(0), box=BoundingBox(120, 20, 180, 60))
     outline = find_outline(view)
@@ -50,6 +56,15 @@ def test_without_intrinsics_a_box_still_says_which_way_the_object_is(textured):
     (ray,) = sightlines([outline])
     assert ray[0] > 0 > ray[1]
     assert np.linalg.norm(ray) == pytest.approx(1)
+
+
+def test_a_box_whose_edge_no_lens_shows_tells_the_direction_alone(textured):
+    """By a focal length of two pixels rays end 40 pixels from the middle."""
+    short = Intrinsics(2, 2, 100, 80)
+    outline = find_outline(replace(textured(0), box=BoundingBox(110, 60, 150, 100), intrinsics=short))
+    np.testing.assert_allclose(outline.middle, np.array([15, 0, 1]) / np.hypot(15, 1), atol=1e-12)
+    assert np.isnan(outline.sides).all()
+    assert find_outline(replace(textured(0), box=BoundingBox(150, 60, 190, 100), intrinsics=short)) is None
 
 
 def test_boxes_place_cameras_that_see_an_object_in_their_corners():

@@ -86,6 +86,12 @@ def test_from_cameras_close_together_the_object_stays_as_far_away_as_predicted()
     moved = about_the_object(rotations, translations, boxed(seen))
     np.testing.assert_allclose(moved[:, 2], 1, atol=0.05)
     np.testing.assert_allclose(moved[:, 0], 0.1, atol=0.02)
+    # The first is at distance one wherever the object is: how far that is, the way between them tells.
+    (before, after) = (
+        np.linalg.norm(np.diff(cameras.camera_centre(rotations, each), axis=0))
+        for each in (translations, moved)
+    )
+    assert after == pytest.approx(before, rel=0.05)
 
 
 def test_cameras_of_which_no_box_tells_stay_as_predicted():

@@ -11,7 +11,7 @@ from relpose_ros.geometry import cameras, so3
 from relpose_ros.inference.bundle_adjustment import refine
 from relpose_ros.inference.camera_positions import apart, joined
 from relpose_ros.inference.local_features import match
-from relpose_ros.inference.matches import NOTHING, TwoViewGeometry
+from relpose_ros.inference.matches import MATCHING_FLOOR, NOTHING, TwoViewGeometry
 from relpose_ros.inference.refined_poses import _informative, settle
 from relpose_ros.inference.two_view_poses import RelativePose
 
@@ -129,6 +129,31 @@ def test_errors_are_within_what_is_stated_and_that_is_less_than_before(point_sce
     assert np.mean(shifts) < 3
 
 
+def test_the_first_camera_which_sets_the_frame_is_known_as_before(point_scene):
+    refined = adjusted(point_scene.ring(ANGLES))
+    joint = settled(refined, before(4))[1]
+    assert np.linalg.eigvalsh(joint[3:6, 3:6]).max() <= 1e-4 * BEFORE[3, 3] * (1 + 1e-9)
+
+
+def test_no_number_of_points_averages_the_intrinsics_away(point_scene):
+    refined = adjusted(point_scene.ring(ANGLES, points=400), noise=0.01)
+    centres, joint = settled(refined, before(4))
+    for centre, covariance in zip(centres[1:], apart(joint)[1:], strict=True):
+        assert np.linalg.eigvalsh(covariance[3:, 3:]).min() >= MATCHING_FLOOR**2
+        assert np.linalg.eigvalsh(covariance[:3, :3]).min() >= MATCHING_FLOOR**2 * centre @ centre
+
+
+def test_a_guessed_focal_length_turns_a_camera_about_the_object(point_scene):
+    """So that it sees the object's middle where it did: a turn r and a shift r x c go together."""
+    refined = adjusted(point_scene.ring(ANGLES))
+    (centres, known), (_, guessed) = (settled(refined, before(4), guessed=guess) for guess in (False, True))
+    for camera in range(1, 4):
+        more = apart(guessed - known)[camera]
+        assert np.trace(more[3:, 3:]) > 1e-3
+        seen = np.concatenate([np.eye(3), so3.hat(centres[camera])], 1)
+        np.testing.assert_allclose(seen @ more @ seen.T, 0, atol=1e-9)
+
+
 def test_fewer_points_know_less(point_scene):
     many, few = (
         settled(adjusted(point_scene.ring(ANGLES, points=count)), before(4))[1] for count in (200, 40)
@@ -159,6 +184,29 @@ def test_cameras_apart_from_the_first_are_known_among_themselves_alone(point_sce
     assert np.trace(joint[9:12, 9:12]) > 0.3 * np.trace(BEFORE[3:, 3:])
     relative = joint[9:12, 9:12] + joint[15:18, 15:18] - joint[9:12, 15:18] - joint[15:18, 9:12]
     assert np.trace(relative) < 0.1 * np.trace(BEFORE[3:, 3:])
+
+
+def test_cameras_apart_from_the_first_keep_its_frame_and_unit(point_scene):
+    refined = adjusted(point_scene.ring(ANGLES), silent=(0,))
+    centres, _ = settled(refined, before(4))
+    np.testing.assert_array_equal(centres, cameras.camera_centre(refined.rotations, refined.translations))
+
+
+def test_an_origin_behind_a_camera_is_none(point_scene):
+    """Lines of sight that meet where nobody looks, as of a box around something else."""
+    refined = adjusted(point_scene.ring(ANGLES))
+    centres, joint = settle(refined, before(4), np.tile([0.0, 0, -1], (4, 1)))
+    np.testing.assert_array_equal(centres, cameras.camera_centre(refined.rotations, refined.translations))
+    assert np.linalg.eigvalsh(joint).min() > 0
+
+
+def test_errors_that_a_camera_shared_with_those_that_moved_are_its_own_now(point_scene):
+    refined = adjusted(point_scene.ring(ANGLES), silent=(2,))
+    shared = before(4) + 1e-4 * np.kron(np.ones((4, 4)), np.eye(6))
+    _, joint = settled(refined, shared)
+    np.testing.assert_array_equal(joint[12:18, 12:18], shared[12:18, 12:18])
+    np.testing.assert_array_equal(joint[12:18, [*range(12), *range(18, 24)]], 0)
+    assert np.linalg.eigvalsh(joint).min() > 0
 
 
 def test_axes_that_hardly_meet_leave_origin_and_unit_as_they_were(point_scene):

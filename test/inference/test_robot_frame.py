@@ -147,6 +147,36 @@ def test_one_wrong_pose_is_outvoted(count, wrong):
     assert found.deviation < 0.1
 
 
+def test_two_that_agree_are_no_majority_of_four():
+    """Any two poses agree on some scale, when their positions alone are wrong along the line between them."""
+    rotations, centres, poses = noisy(4, 3)
+    for camera, shift in ((1, [0.4, 0, 0]), (2, [0, 0.5, 0.3])):
+        old = poses[camera]
+        poses[camera] = RobotPose("base", old.robot_from_camera, old.position + shift, ARM)
+    found = find_robot_frame(rotations, centres, spread(4, 0.02, 0.02), poses)
+    assert found == "the robot's camera poses contradict the ones that were found"
+
+
+def test_of_the_majorities_that_agree_the_best_counts():
+    """A wrong pose that is not too far off goes together with some of the others."""
+    rotations, centres = around(4, 5)
+    poses = told(rotations, centres)
+    old = poses[1]
+    poses[1] = RobotPose("base", old.robot_from_camera, old.position + np.array([0.12, 0, 0]), ARM)
+    found = find_robot_frame(rotations, centres, spread(4, 0.02, 0.02), poses)
+    assert found.scale == pytest.approx(METRES, rel=1e-6)
+
+
+def test_errors_larger_than_stated_make_the_scale_as_uncertain_as_they_are():
+    """Up to twice as large, from where on the poses contradict each other."""
+    scales = []
+    for seed in range(60):
+        rotations, centres, poses = noisy(8, seed, 0.035, 0.035)
+        found = find_robot_frame(rotations, centres, spread(8, 0.02, 0.02), poses)
+        scales.append(math.log(found.scale / METRES) / found.deviation)
+    assert 0.5 < np.mean(np.square(scales)) < 1.7
+
+
 def test_poses_that_contradict_each_other_tell_nothing():
     """As where the robot gives the camera's body instead of its optical frame."""
     rotations, centres, poses = noisy(4, 5)
@@ -216,6 +246,14 @@ def test_a_camera_whose_own_pose_nobody_knows_takes_no_part():
     wrong = find_robot_frame(rotations, centres, covariance, poses)
     assert (wrong.scale, wrong.deviation) == (known.scale, known.deviation)
     pair = find_robot_frame(rotations, centres, covariance, [*poses[:2], None, None])
+    assert pair == "of the views whose camera pose is known, less than two are tied to the others"
+
+
+def test_a_camera_that_may_be_turned_about_one_axis_takes_no_part():
+    rotations, centres, poses = noisy(3, 8)
+    covariance = spread(3, 0.02, 0.02)
+    covariance[10, 10] = math.radians(60) ** 2
+    pair = find_robot_frame(rotations, centres, covariance, [*poses[:2], None])
     assert pair == "of the views whose camera pose is known, less than two are tied to the others"
 
 

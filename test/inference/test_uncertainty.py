@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relpose_ros.estimates import Evidence, Verdict
+from relpose_ros.estimates import Evidence, PairRotation, Verdict
 from relpose_ros.geometry import so3
 from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.global_rotations import solve
@@ -86,6 +86,53 @@ def test_how_far_the_poses_are_from_a_pair_is_told_of_its_modes_alone(fisher_sce
     assert len(pairs[0].modes) == 1
     assert pairs[0].solution_angle == pytest.approx(2.5, abs=0.05)
     assert pairs[1].solution_angle < 0.01
+
+
+def test_each_mode_has_a_covariance_of_its_own(fisher_scene, cameras_around):
+    """The heavier mode comes first, and the narrow one is the higher."""
+    scene = fisher_scene(cameras_around(2, 0))
+    broad, narrow = scene.relative(0, 1), so3.exp([0, 2.0, 0]) @ scene.relative(0, 1)
+    scene.mixtures[0, 1] = [(broad, 0.0, 8.0), (narrow, 2.0, 100.0)]
+    (pair,), _, _ = told(scene)
+    angles = [math.degrees(so3.angle_between(mode.camera_j_from_camera_i, broad)) for mode in pair.modes[:2]]
+    assert angles[0] < 3 < 100 < angles[1]
+    first, second = (np.trace(mode.covariance) / 3 for mode in pair.modes[:2])
+    assert first == pytest.approx(1 / 16, rel=0.3)
+    assert second == pytest.approx(1 / 200, rel=0.5)
+
+
+def test_only_what_the_network_says_alone_is_widened_by_its_factor(fisher_scene, cameras_around):
+    """The width of a matched peak is fitted by itself."""
+    scene = fisher_scene(cameras_around(3, 0), concentration=20.0)
+    peaks = [[Peak(scene.relative(0, 1), 1e-3 * np.eye(3), 0.9)], [], []]
+    energies = PairEnergies.of(scene, scene, 3, evidence=RotationEvidence(peaks))
+    distributions = search(energies, GridEmbeddings(scene))
+    plain, widened = (
+        describe_pairs(
+            distributions, energies, torch.from_numpy(scene.cameras), Calibration(pair_spread=factor)
+        )
+        for factor in (1.0, 4.0)
+    )
+    for before, after, factor in zip(plain, widened, (1, 4, 4), strict=True):
+        np.testing.assert_allclose(after.covariance, factor * before.covariance)
+        np.testing.assert_allclose(after.modes[0].covariance, factor * before.modes[0].covariance)
+
+
+def test_the_first_cameras_distance_is_the_unit(fisher_scene, cameras_around):
+    calibration = Calibration(position_sigma=(0.02, 0.05))
+    _, covariances, _ = told(fisher_scene(cameras_around(3, 5)), calibration)
+    assert covariances[0, 2, 2] == pytest.approx(SOLVER_FLOOR**2, rel=0.01)
+    np.testing.assert_allclose(np.diag(covariances[0, :2, :2]), 0.02**2, rtol=0.02)
+
+
+def test_a_camera_that_may_look_any_way_may_stand_anywhere_around_the_object(fisher_scene, cameras_around):
+    """Half of the time on the other side of it."""
+    calibration = Calibration(position_sigma=(0.01, 0.01))
+    _, covariances, rotations = told(fisher_scene(cameras_around(2, 3), concentration=0.0), calibration)
+    ray = rotations[1].T @ [0, 0, 1]
+    along = ray @ covariances[1, :3, :3] @ ray
+    draws = so3.random_rotations(20_000, np.random.default_rng(0))[:, 2, 2] - 1
+    assert 0.5 * (draws**2).mean() < along < 2 * (draws**2).mean() + 2
 
 
 def test_a_modes_covariance_is_that_of_its_core_and_the_total_one_holds_all(fisher_scene, cameras_around):
@@ -416,6 +463,112 @@ def test_enough_means_fifteen_degrees_at_two_standard_deviations(
     verdict, _, words = judge(pairs, covariances, calibrated=True)
     assert (verdict is Verdict.ENOUGH) is enough
     assert enough or words.startswith("one more view: rotations are known to about 8 degrees only")
+
+
+def pairs_of(views, **others):
+    """Pairs as sure as agreeing; ``p12=(0.9, 0.3)`` has pair 1-2 be sure by 0.9, and agree by 0.3."""
+    cameras = so3.exp(np.arange(views)[:, None] * [0.1, 0.4, 0.0])
+    made = []
+    for i, j in itertools.combinations(range(views), 2):
+        within, agreeing = others.get(f"p{i}{j}", (0.95, 0.95))
+        made.append(
+            PairRotation(
+                i=i,
+                j=j,
+                camera_j_from_camera_i=cameras[j] @ cameras[i].T,
+                covariance=0.01 * np.eye(3),
+                entropy=-5.0,
+                probability_within_15_deg=within,
+                modes=(),
+                ambiguous=False,
+                ambiguity_angle=0.0,
+                solution_probability=agreeing,
+                solution_angle=0.0 if agreeing > 0.5 else 1.0,
+            )
+        )
+    return made
+
+
+EXACT = np.tile(1e-4 * np.eye(6), (8, 1, 1))
+
+
+def test_a_pair_that_is_sure_of_what_the_poses_are_not_ties_nothing():
+    """A chain from view 0 over 3 and 2 to 1, against the order of the views in their pairs."""
+    nothing = (0.01, 0.01)
+    tied = {"p01": nothing, "p02": nothing, "p13": nothing}
+    assert "hangs on pair" in judge(pairs_of(4, **tied), EXACT[:4], True)[2]
+    sure_of_else = pairs_of(4, **tied, p12=(0.95, 0.3))
+    verdict, weakest, words = judge(sure_of_else, EXACT[:4], True)
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert "hang" not in words
+    assert 1 in (sure_of_else[weakest].i, sure_of_else[weakest].j)
+
+
+def test_a_pair_that_is_sure_and_does_not_quite_agree_contradicts_nothing():
+    """One in three of its probability is around the poses."""
+    pairs = pairs_of(5, p03=(0.95, 0.35), p14=(0.95, 0.35), p23=(0.95, 0.35))
+    assert judge(pairs, EXACT[:5], True)[0] is Verdict.ENOUGH
+    pairs = pairs_of(5, p03=(0.95, 0.05), p14=(0.95, 0.05), p23=(0.95, 0.05))
+    assert judge(pairs, EXACT[:5], True)[0] is Verdict.ONE_MORE_VIEW
+
+
+def test_one_contradiction_for_six_pairs_that_agree_is_enough():
+    lie, nothing = (0.95, 0.05), (0.01, 0.01)
+    outvoted = {"p02": lie, "p03": nothing, "p14": nothing, "p24": nothing}
+    assert judge(pairs_of(5, **outvoted), EXACT[:5], True)[0] is Verdict.ENOUGH
+    five = {**outvoted, "p13": nothing}
+    verdict, _, words = judge(pairs_of(5, **five), EXACT[:5], True)
+    assert verdict is Verdict.ONE_MORE_VIEW
+    assert words.startswith("one more view: 5 of 10 pairs agree, but 1 are as sure of something else")
+
+
+def test_the_surest_of_the_pairs_that_contradict_is_named():
+    pairs = pairs_of(4, p02=(0.7, 0.05), p13=(0.9, 0.05))
+    _, weakest, words = judge(pairs, EXACT[:4], True)
+    assert (pairs[weakest].i, pairs[weakest].j) == (1, 3)
+    assert "pair 1-3 contradicts the others" in words
+
+
+def test_of_pairs_that_nothing_checks_the_least_certain_is_named():
+    """A chain of views: every pair ties what lies beyond it."""
+    nothing = (0.01, 0.01)
+    pairs = pairs_of(4, p02=nothing, p03=nothing, p13=nothing, p12=(0.9, 0.85))
+    _, weakest, words = judge(pairs, EXACT[:4], True)
+    assert (pairs[weakest].i, pairs[weakest].j) == (1, 2)
+    assert words == "one more view: views 2 and 3 hang on pair 1-2 alone, which no other pair checks"
+
+
+def test_of_a_scan_that_is_enough_the_weakest_pair_is_the_one_that_agrees_least():
+    pairs = pairs_of(4, p12=(0.95, 0.7))
+    verdict, weakest, _ = judge(pairs, EXACT[:4], True)
+    assert verdict is Verdict.ENOUGH
+    assert (pairs[weakest].i, pairs[weakest].j) == (1, 2)
+
+
+def test_the_weak_link_is_that_of_the_best_chain():
+    """View 2 hangs on 1 by four chances in ten, and on 0 by one in ten: a view between 1 and 2 would help."""
+    pairs = pairs_of(3, p02=(0.1, 0.1), p12=(0.4, 0.4))
+    _, weakest, words = judge(pairs, EXACT[:3], True)
+    assert (pairs[weakest].i, pairs[weakest].j) == (1, 2)
+    assert words == "one more view: pair 1-2 knows its rotation to 15 degrees with 40% only"
+
+
+def test_only_matches_that_are_trusted_ask_for_a_known_focal_length():
+    pairs = pairs_of(4, p03=(0.3, 0.3))
+    both = Evidence.LEARNED | Evidence.GEOMETRIC
+    by_matches = [replace(pair, evidence=both) if (pair.i, pair.j) == (0, 3) else pair for pair in pairs]
+    assert judge(by_matches, EXACT[:4], True, guessed=True)[0] is Verdict.ENOUGH
+    by_matches = [replace(pair, evidence=both) if (pair.i, pair.j) == (0, 2) else pair for pair in pairs]
+    assert judge(by_matches, EXACT[:4], True, guessed=True)[0] is Verdict.ONE_MORE_VIEW
+
+
+def test_a_pair_that_is_not_trusted_does_not_say_that_two_views_are_one():
+    """Two that look alike: the pair of 0 and 1 takes them for one place, and the poses do not."""
+    pairs = pairs_of(4, p01=(0.95, 0.4), p23=(0.01, 0.01))
+    pairs[0] = replace(pairs[0], camera_j_from_camera_i=np.eye(3))
+    assert judge(pairs, EXACT[:4], True)[0] is Verdict.ENOUGH
+    pairs[0] = replace(pairs[0], solution_probability=0.95)
+    assert judge(pairs, EXACT[:4], True)[0] is Verdict.ONE_MORE_VIEW
 
 
 def test_flat_pairs_are_not_enough(fisher_scene, cameras_around):

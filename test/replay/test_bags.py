@@ -8,6 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -141,6 +143,29 @@ def test_a_file_damaged_inside_is_read_up_to_the_damage(
     assert f"is damaged after {len(got)} messages" in caplog.text
 
 
+def test_what_does_not_match_its_checksum_is_not_saved(tmp_path: Path) -> None:
+    """The end is lost, and before it a few letters were changed: the messages would still read."""
+    file = tmp_path / "recorded.mcap"
+    with file.open("wb") as stream:
+        writer = McapWriter(stream, compression=CompressionType.NONE)  # with checksums, as ROS 2 records
+        writer.start("ros2")
+        schema = writer.register_schema(STRING, "ros2msg", b"string data")
+        channel = writer.register_channel("/a", "cdr", schema)
+        for time in range(3000):
+            data = bytes(JAZZY.serialize_cdr(JAZZY.types[STRING](data=f"/a {time} {'x' * 1500}"), STRING))
+            writer.add_message(channel, time, data, time)
+        writer.finish()
+    content = bytearray(file.read_bytes())
+    del content[len(content) * 9 // 10 :]
+    spoiled = content.index(b"/a 1500 ") + 100
+    content[spoiled : spoiled + 20] = b"!" * 20
+    file.write_bytes(content)
+    with BagReader(file) as bag:
+        messages = [record.message.data for record in bag.records(["/a"])]
+    assert 500 < len(messages) <= 1500
+    assert not any("!" in message for message in messages)
+
+
 def test_a_damaged_database_is_refused(tmp_path: Path) -> None:
     write_strings(tmp_path / "bag", {"/a": list(range(500))}, StoragePlugin.SQLITE3, size=1500)
     file = only_file(tmp_path / "bag", ".db3")
@@ -221,6 +246,27 @@ def test_the_bags_own_definition_of_a_type_is_believed(tmp_path: Path) -> None:
     with BagReader(tmp_path / "bag") as bag:
         (record,) = bag.records(["/object_view"])
     assert (record.message.object_id, record.message.sharpness) == ("mug", 7)
+
+
+def test_the_bags_own_definition_goes_before_that_of_this_package(tmp_path: Path) -> None:
+    """Also where the bag has none of another type."""
+    from rosbags.typesys import get_types_from_msg
+
+    old = get_typestore(Stores.ROS2_JAZZY)
+    old.register(get_types_from_msg("string object_id\nuint8 sharpness", OBJECT_VIEW))
+    with Writer(tmp_path / "one", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/object_view", OBJECT_VIEW, typestore=old)
+        message = old.types[OBJECT_VIEW](object_id="mug", sharpness=7)
+        writer.write(connection, 1, old.serialize_cdr(message, OBJECT_VIEW))
+    write_strings(tmp_path / "two", {"/a": [2]}, StoragePlugin.SQLITE3)
+    drop_definitions(only_file(tmp_path / "two", ".db3"))
+    (tmp_path / "bag").mkdir()
+    only_file(tmp_path / "one", ".mcap").rename(tmp_path / "bag/bag_0.mcap")
+    only_file(tmp_path / "two", ".db3").rename(tmp_path / "bag/bag_1.db3")
+    with BagReader(tmp_path / "bag") as bag:
+        first, second = bag.records(["/object_view", "/a"])
+    assert (first.message.object_id, first.message.sharpness) == ("mug", 7)
+    assert second.message.data.startswith("/a 2 ")
 
 
 def drop_definitions(path: Path) -> None:
@@ -334,6 +380,15 @@ Kind = Literal["object_view", "image", "compressed", "camera_info"]
             {"/image": IMAGE, "/image/compressed": COMPRESSED_IMAGE, "/camera_info": CAMERA_INFO},
             ["image/compressed"],
             {"/image/compressed": ("compressed", "/image"), "/camera_info": ("camera_info", "/image")},
+        ),
+        (
+            {"/image": IMAGE, "/image/compressed": COMPRESSED_IMAGE, "/camera_info": CAMERA_INFO},
+            ["/image", "/image/compressed"],
+            {
+                "/image": ("image", "/image"),
+                "/camera_info": ("camera_info", "/image"),
+                "/image/compressed": ("compressed", "/image"),
+            },
         ),
         (
             {"/views": OBJECT_VIEW, "/more_views": OBJECT_VIEW, "/image": IMAGE},

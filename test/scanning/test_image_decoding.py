@@ -339,6 +339,16 @@ def test_a_thumbnail_does_not_pass_for_the_end_of_a_picture(bag_messages: Any) -
         decode_compressed(bag_messages.compressed(with_thumbnail[:-40]))
 
 
+def test_a_table_before_the_frame_header_is_not_taken_for_it(bag_messages: Any) -> None:
+    """Its marker lies among those of frame headers; cameras may send it first."""
+    data = encoded(".jpg", photo())
+    frame, table = data.index(b"\xff\xc0"), data.index(b"\xff\xc4")
+    end = table + 2 + int.from_bytes(data[table + 2 : table + 4], "big")
+    first = bag_messages.compressed(data[:frame] + data[table:end] + data[frame:table] + data[end:])
+    assert compressed_size(first) == (48, 32)
+    np.testing.assert_array_equal(decode_compressed(first), decode_compressed(bag_messages.compressed(data)))
+
+
 def png_chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 

@@ -116,6 +116,14 @@ WRONG_OBJECT_VIEWS: list[tuple[dict[str, Any], str]] = [
         {"crop": (30, 30, 40, 32), "full": (100, 100)},
         r"the box \[8, 8, 24, 24\] lies outside the picture, which shows \[30, 30, 70, 62\]",
     ),
+    (
+        {"crop": (0, 10, 40, 32), "full": (40, 100)},
+        r"the box \[8, 8, 24, 24\] lies outside the picture, which shows \[0, 10, 40, 42\]",
+    ),
+    ({"crop": (10, 0, 40, 32), "full": (100, 32)}, "lies outside the picture, which shows"),
+    ({"crop": (0, 0, 40, 32), "full": (100, 32), "box": (30, 8, 16, 16)}, "lies outside the picture, which"),
+    ({"crop": (0, 0, 40, 32), "full": (40, 100), "box": (8, 20, 16, 16)}, "lies outside the picture, which"),
+    ({"crop": (0, 1, 40, 32)}, r"the crop \[0, 1, 40, 33\] lies outside the full image"),
     ({"k": (NAN, 0, 20, 0, 500, 16, 0, 0, 1)}, r"the intrinsic matrix holds what is no number: \[nan, 0.0,"),
     ({"k": (500, 0, 20, 0, 500, 16, 0, 0, float("inf"))}, "no number"),
     ({"k": (500, 0, 20, 0, 0, 16, 0, 0, 1)}, "focal length in the intrinsic matrix is 500.0, 0.0"),
@@ -129,6 +137,7 @@ WRONG_OBJECT_VIEWS: list[tuple[dict[str, Any], str]] = [
     ),
     ({"k": (-500, 0, 20, 0, 500, 16, 0, 0, 1)}, "must be positive"),
     ({"k": (1.2, 0, 0.5, 0, 1.2, 0.5, 0, 0, 1)}, "is 1.2, 1.2 for 40 x 32 pixels: it must be in pixels"),
+    ({"k": (500, 0, 20, 0, 1.2, 16, 0, 0, 1)}, "is 500.0, 1.2 for 40 x 32 pixels: it must be in pixels"),
     ({"frame_id": "x" * 129}, r"frame_id has 129 characters, more than 128: 'x{40}'\.\.\."),
     ({"frame_id": "a\x00b"}, r"frame_id 'a\\x00b' holds what cannot be printed"),
 ]
@@ -240,6 +249,16 @@ def test_a_raw_picture_has_the_lens_s_distortion_and_a_rectified_one_a_matrix_of
         assert view.distortion is None
 
 
+def test_a_rectified_picture_without_a_matrix_of_its_own_has_that_of_the_raw_one(messages: Any) -> None:
+    """As of drivers that leave P empty; what the lens bent is straight all the same."""
+    image, info = messages.rgb(picture()), messages.camera_info(40, 32)
+    info.d[0] = -0.3
+    assert not any(info.p)
+    view = view_from_image(image, info, source_of(image, "/camera/image_rect"))
+    assert view.intrinsics == Intrinsics(500.0, 500.0, 320.5, 240.5)
+    assert view.distortion is None
+
+
 def test_a_straight_lens_and_an_unknown_camera_have_no_distortion(messages: Any) -> None:
     assert view_of_pair(messages.rgb(picture()), messages.camera_info(40, 32)).distortion is None
     info = messages.camera_info(40, 32, k=(0,) * 9)
@@ -297,6 +316,7 @@ def test_an_uncalibrated_camera_needs_no_size(messages: Any) -> None:
         ({"width": 40, "height": 32, "roi": (30, 4, 20, 20)}, "lies outside the full image of 40 x 32"),
         ({"width": 50, "height": 40, "roi": (30, 4, 40, 32)}, "lies outside the full image of 50 x 40"),
         ({"width": 40, "height": 32, "binning": (2, 2)}, "binning is 2 x 2 in camera_info"),
+        ({"width": 40, "height": 32, "binning": (0, 2)}, "binning is 0 x 2 in camera_info"),
         ({"width": 40, "height": 32, "k": (NAN,) * 9}, "no number"),
     ],
 )
@@ -305,12 +325,16 @@ def test_a_wrong_camera_info_is_rejected(messages: Any, info: dict[str, Any], sa
         view_of_pair(messages.rgb(picture()), messages.camera_info(**info))
 
 
-def test_a_strip_of_a_picture_is_refused_before_it_takes_the_memory(messages: Any) -> None:
+@pytest.mark.parametrize("size", [(10_000, 8), (8, 10_000)])
+def test_a_strip_of_a_picture_is_refused_before_it_takes_the_memory(
+    messages: Any, size: tuple[int, int]
+) -> None:
     """The network's crop would be a square on its longer side."""
-    strip = messages.image(bytes(3 * 10_000 * 8), 10_000, 8, "rgb8", 3 * 10_000)
-    said = r"the box \[0, 0, 10000, 8\] is too large: a side has at most 8192 pixels"
+    width, height = size
+    strip = messages.image(bytes(3 * width * height), width, height, "rgb8", 3 * width)
+    said = rf"the box \[0, 0, {width}, {height}\] is too large: a side has at most 8192 pixels"
     with pytest.raises(ViewError, match=said):
-        view_of(messages.object_view(image=strip, full=(10_000, 8), box=(0, 0, 10_000, 8)))
+        view_of(messages.object_view(image=strip, full=size, box=(0, 0, *size)))
 
 
 def test_binning_by_one_is_none(messages: Any) -> None:
@@ -366,6 +390,14 @@ def test_a_covariance_that_comes_with_a_pose_counts_unless_it_is_all_zero(messag
     np.testing.assert_allclose(pose_of(messages.camera_pose(covariance=own)).covariance, own)
     unknown = pose_of(messages.camera_pose(covariance=np.zeros((6, 6))))
     np.testing.assert_allclose(unknown.covariance, np.diag([0.005**2] * 3 + [0.01**2] * 3))
+
+
+def test_a_covariance_is_made_symmetric(messages: Any) -> None:
+    lopsided = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    lopsided[0, 4] = 0.1
+    expected = np.diag(np.diag(lopsided))
+    expected[0, 4] = expected[4, 0] = 0.05
+    np.testing.assert_allclose(pose_of(messages.camera_pose(covariance=lopsided)).covariance, expected)
 
 
 def test_a_quaternion_that_was_rounded_is_normalised(messages: Any) -> None:

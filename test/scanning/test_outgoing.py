@@ -223,6 +223,19 @@ def test_the_colours_run_from_red_to_magenta(messages: Any, scan: Scan, estimate
     assert all(marker.type == TEXT and marker.scale.z > 0 for marker in drawn(array, "indices"))
 
 
+def test_an_index_stands_above_its_camera_as_the_image_has_it(
+    bag_messages: Any, scan: Scan, estimate: ScanEstimate
+) -> None:
+    """Also above one that is rolled; y points down."""
+    rolled = replace(estimate.cameras[1], object_from_camera=so3.exp([0.0, 0.0, 1.0]))
+    cameras = (estimate.cameras[0], rolled, estimate.cameras[2])
+    array = markers(replace(estimate, cameras=cameras), scan, bag_messages.types, "object")
+    for marker, camera in zip(drawn(array, "indices"), cameras, strict=True):
+        above = (xyz(marker.pose.position) - camera.position) @ camera.object_from_camera
+        assert above[1] < 0
+        np.testing.assert_allclose(above[[0, 2]], 0, atol=1e-12)
+
+
 def test_the_object_is_at_the_origin(messages: Any, scan: Scan, estimate: ScanEstimate) -> None:
     *axes, sphere = drawn(markers(estimate, scan, messages.types, "object"), "object")
     assert sphere.type == SPHERE

@@ -91,7 +91,7 @@ def test_what_waits_longest_goes_when_there_is_too_much() -> None:
     pairing = Pairing(3, 1000)
     pairs(pairing, "image", *range(10))
     assert (pairing.waiting(), pairing.images_alone) == (3, 7)
-    assert len(pairs(pairing, "camera_info", *range(10))) == 3
+    assert [image[1] for image, _ in pairs(pairing, "camera_info", *range(10))] == [7, 8, 9]
     assert (pairing.waiting(), pairing.images_alone) == (0, 7)
 
 
@@ -105,6 +105,19 @@ def test_pairing_goes_on_after_time_jumped_back() -> None:
         found += pairs(pairing, "image", stamp) + pairs(pairing, "camera_info", stamp)
     assert [info[1] for _, info in found] == list(range(0, 20_000, 500))
     assert pairing.waiting() == 0, "the images of the first round are forgotten"
+
+
+def test_what_lies_ahead_of_a_jump_waits_no_longer() -> None:
+    pairing = Pairing(30, 1000)
+    pairs(pairing, "image", 10_000, 10_500, 0, 500)
+    assert pairing.waiting() == 2
+    assert pairs(pairing, "camera_info", 10_000, 10_500) == []
+
+
+def test_a_stamp_that_is_never_set_is_no_jump() -> None:
+    pairing = Pairing(30, 1000)
+    pairs(pairing, "image", 5000, 0, 0, 0)
+    assert len(pairs(pairing, "camera_info", 5000)) == 1
 
 
 def test_a_garbage_stamp_costs_no_waiting_image() -> None:

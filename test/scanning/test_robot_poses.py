@@ -67,12 +67,27 @@ def test_a_pose_that_comes_again_is_no_news_and_another_one_is() -> None:
     assert found.position[0] == 0.6
 
 
+def test_the_same_numbers_in_another_frame_or_with_another_spread_are_news() -> None:
+    poses = RobotPoses()
+    source = Source("camera_pose", 1, "base")
+    turned = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    told = [
+        pose(),
+        replace(pose(), frame_id="map"),
+        replace(pose(), robot_from_camera=turned),
+        replace(pose(), covariance=2 * np.eye(6)),
+    ]
+    assert [poses.put(source, each, ())[0] for each in told] == [True] * 4
+
+
 def test_a_pose_is_claimed_once() -> None:
     poses = RobotPoses()
     put(poses, 1)
     assert poses.claim(2) is None
     assert poses.claim(1) == Source("camera_pose", 1, "base")
     assert poses.claim(1) is None
+    assert put(poses, 1, 0.5) == (True, [])
+    assert poses.claim(1) is None, "the view has it already, if with other numbers"
 
 
 def test_the_oldest_goes_unless_its_view_is_held(monkeypatch: Any) -> None:

@@ -155,6 +155,32 @@ def test_after_a_newcomer_in_vain_the_next_ones_wait_longer_and_longer(
     assert stamps_of(buffer) == [1, 7.4, 7.5]
 
 
+def test_the_pause_is_short_again_after_a_newcomer_that_gained(circle_estimator: Callable[..., Any]) -> None:
+    azimuths = {4.0: 31.0, 4.2: 31.0, 4.6: 170.0, 4.7: 171.0, 4.9: 100.0}
+    estimator = circle_estimator(lambda stamp: azimuths.get(round(stamp, 1), 30.0 * (stamp - 1)))
+    buffer = buffer_with(1, 2, 3, keep="spread", max_views=3)
+    estimate_all(buffer, estimator)
+    stood = []
+    for stamp in azimuths:
+        assert add(buffer, stamp)[0].accepted, stamp
+        stood += estimate_all(buffer, estimator)
+    assert stood == [False, False, True, False, True]
+
+
+def test_a_jump_of_time_ends_the_pause(circle_estimator: Callable[..., Any]) -> None:
+    """It would last until the bag that loops is where it was."""
+    azimuths = {1: 0.0, 2: 40.0, 3: 90.0, 4: 180.0, 100: 0.0, 101: 40.0, 102: 90.0, 103: 1.0}
+    estimator = circle_estimator(lambda stamp: azimuths[round(stamp)])
+    buffer = buffer_with(100, 101, 102, keep="spread", max_views=3)
+    estimate_all(buffer, estimator)
+    add(buffer, 103)
+    assert estimate_all(buffer, estimator) == [False]
+    add(buffer, 1, 2, 3)
+    estimate_all(buffer, estimator)
+    assert stamps_of(buffer) == [1, 2, 3]
+    assert add(buffer, 4)[0].accepted
+
+
 def test_those_that_wait_behind_a_newcomer_in_vain_go_with_it(circle_estimator: Callable[..., Any]) -> None:
     azimuths = {1.0: 0.0, 2.0: 90.0, 3.0: 90.5, 3.1: 45.0, 3.3: 170.0}
     estimator = circle_estimator(lambda stamp: azimuths[round(stamp, 1)])
@@ -251,6 +277,61 @@ def test_a_view_that_estimates_fail_of_is_found_and_let_go(
     assert estimate_all_but_bad(buffer) == [(1, 2, 4, 5)]
 
 
+def fail(buffer: ScanBuffer) -> None:
+    """As an estimator that fails of whatever there is to estimate."""
+    work = buffer.work()
+    assert work is not None
+    buffer.give_up(work)
+
+
+def test_failures_with_a_good_estimate_between_them_blame_no_view(
+    circle_estimator: Callable[..., Any],
+) -> None:
+    buffer = buffer_with(1, 2, 3)
+    fail(buffer)
+    add(buffer, 4)
+    estimate_all(buffer, circle_estimator())
+    add(buffer, 5, 6)
+    fail(buffer)
+    assert not buffer.has_work(), "it is the first failure since all went well"
+
+
+def test_no_view_is_blamed_once_all_of_them_were_estimated(circle_estimator: Callable[..., Any]) -> None:
+    """A view comes before those that estimates may fail of are left out in turn."""
+    buffer = buffer_with(1, 2, 3)
+    fail(buffer)
+    add(buffer, 4)
+    fail(buffer)
+    assert buffer.has_work(), "one of the views may be to blame"
+    add(buffer, 5)
+    work = buffer.work()
+    assert work is not None
+    assert buffer.settle(work, circle_estimator().estimate(Scan("mug", work.views)))
+    assert not buffer.has_work()
+    assert stamps_of(buffer) == [1, 2, 3, 4, 5]
+
+
+def test_of_two_views_none_can_be_left_out() -> None:
+    buffer = buffer_with(1, 2)
+    fail(buffer)
+    buffer.require_work()
+    fail(buffer)
+    assert not buffer.has_work()
+
+
+def test_no_newcomer_is_tried_against_an_estimate_of_fewer_views(
+    circle_estimator: Callable[..., Any],
+) -> None:
+    """The last estimate that did not fail is of two of the three views held."""
+    buffer = buffer_with(1, 2, keep="spread", max_views=3)
+    work = buffer.work()
+    assert work is not None
+    add(buffer, 3, 9)
+    assert buffer.settle(work, circle_estimator().estimate(Scan("mug", work.views)))
+    fail(buffer)
+    assert not buffer.has_work()
+
+
 def test_where_no_view_alone_is_to_blame_all_stay() -> None:
     buffer = buffer_with(1, 2)
     tried = []
@@ -261,6 +342,16 @@ def test_where_no_view_alone_is_to_blame_all_stay() -> None:
         add(buffer, stamp)
     assert tried == [2, 3, 2, 2, 2]
     assert stamps_of(buffer) == [1, 2, 3, 4]
+
+
+def test_a_camera_that_delivers_late_does_not_turn_its_topics_clock_back() -> None:
+    """The clock of the topic tells of a jump, whichever camera's view came last."""
+    buffer = ScanBuffer("mug", ScanSettings())
+    for stamp, frame in ((99, "left"), (100, "left"), (102, "left"), (101.5, "right")):
+        assert buffer.add(view(stamp, frame), "a").accepted
+    first, second = (buffer.add(view(stamp, "left"), "a") for stamp in (100.9, 100.95))
+    assert "rejected unless the next one confirms that time jumped backwards" in first.reason
+    assert second.accepted
 
 
 def test_another_camera_tells_of_a_jump_by_more_than_a_moment() -> None:
@@ -578,6 +669,16 @@ def test_other_settings_let_go_of_what_is_too_much() -> None:
         assert stamps_of(buffer) == left, keep
     buffer.change_settings(ScanSettings(keep="spread", max_views=8))
     assert stamps_of(buffer) == [1, 2, 3, 4, 5], "those that had no place are still there"
+
+
+def test_another_setting_says_how_far_back_a_jump_lies() -> None:
+    buffer = buffer_with(10, 11)
+    buffer.change_settings(ScanSettings(backward_jump_s=5.0))
+    (late,) = add(buffer, 9.5)
+    assert "views of a camera have to come in the order of their stamps" in late.reason
+    buffer.change_settings(ScanSettings(backward_jump_s=0.1))
+    (suspect,) = add(buffer, 10.8)
+    assert "rejected unless the next one confirms that time jumped backwards" in suspect.reason
 
 
 def test_the_most_redundant_view_is_the_one_with_the_closest_neighbours() -> None:

@@ -313,6 +313,31 @@ def test_camera_infos_whose_images_are_lost_are_counted(
     assert told() == (14, False)
 
 
+def test_a_camera_info_that_comes_again_without_its_image_is_lost_too(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    """As of a bag that loops: the image of the last round is none of this one."""
+    now = [0.0]
+    scanner = Scanner(circle_estimator(), ScanSettings(), clock=lambda: now[0])
+    scanner.receive("image", "image", bag_messages.rgb(pixels(), stamp=1))
+    for alone in (0, 1):
+        scanner.receive("camera_info", "info", bag_messages.camera_info(40, 32, (4, 4, 20, 20), stamp=1))
+        now[0] += 3.0
+        assert scanner.statistics().infos_alone == alone
+
+
+def test_another_setting_says_how_far_back_a_jump_lies_for_images_that_wait(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    scanner = Scanner(circle_estimator(), ScanSettings())
+    scanner.receive("image", "image", bag_messages.rgb(pixels(), stamp=10))
+    scanner.change_settings(ScanSettings(backward_jump_s=60.0))
+    for stamp in (5, 6):
+        scanner.receive("image", "image", bag_messages.rgb(pixels(), stamp=stamp))
+    info = bag_messages.camera_info(40, 32, (4, 4, 20, 20), stamp=10)
+    assert scanner.receive("camera_info", "info", info).accepted, "no jump of time had the image forgotten"
+
+
 def test_other_evidence_has_every_scan_estimated_again(
     bag_messages: Any, circle_estimator: Callable[..., Any]
 ) -> None:
@@ -931,6 +956,22 @@ def test_a_pose_that_comes_after_the_estimate_has_it_made_anew(
     assert not send_pose(scanner, messages, 2, 0.2).accepted, "nothing new"
     assert not send_pose(scanner, messages, 2.5).accepted, "no view has this stamp yet"
     assert not scanner.pending()
+
+
+def test_views_on_trial_have_the_poses_of_their_own_stamps(
+    bag_messages: Any, circle_estimator: Callable[..., Any]
+) -> None:
+    """A newcomer stands last, in the place of another view: of the views held the poses would be others."""
+    azimuths = {1: 0.0, 2: 40.0, 3: 41.0, 4: 120.0, 5: 119.0}
+    estimator = circle_estimator(lambda stamp: azimuths[round(stamp)])
+    scanner = Scanner(estimator, ScanSettings(keep="spread", max_views=3))
+    for stamp in azimuths:
+        send_pose(scanner, bag_messages, stamp, float(stamp))
+        send_views(scanner, bag_messages, stamp)
+        drain(scanner)
+    assert [stamps_of(scan) for scan in estimator.scans[-2:]] == [[1, 3, 4], [1, 4, 5]]
+    for scan in estimator.scans:
+        assert poses_of(scan) == stamps_of(scan)
 
 
 def test_a_bad_pose_costs_no_view(messages: Any, circle_estimator: Callable[..., Any]) -> None:
