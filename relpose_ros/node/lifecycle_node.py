@@ -229,7 +229,8 @@ class ScanNode(LifecycleNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take nothing more; the views taken so far still get their estimate. They stay held."""
         self._active = False
-        wait(self._jobs)
+        while under_way := [job for job in self._jobs if not job.done()]:  # one job may ask for the next
+            wait(under_way)
         return super().on_deactivate(state)
 
     @_guarded
@@ -372,8 +373,10 @@ class ScanNode(LifecycleNode):
         # Cleared first: a view that arrives from here on asks again.
         self._estimate_asked = False
         scanner = self._scanner
-        while scanner is not None and not self._closing and scanner.pending():
+        if scanner is not None and not self._closing and scanner.pending():
             self._estimate(scanner, scanner.estimate_pending)
+            # Behind who else waits: an estimate that was asked for comes before the stream of views ends.
+            self._ask_for_estimate()
 
     def _estimate(self, scanner: Scanner, estimate: Callable[[], list[Result]]) -> list[Result]:
         """One round of estimates, published."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,8 @@ from relpose_ros.msg import ObjectView
 from sensor_msgs.msg import CompressedImage, Image
 
 from relpose_ros.node.lifecycle_node import ScanNode
+from relpose_ros.scanning.scanner import Scanner
+from relpose_ros.scanning.settings import ScanSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -182,6 +185,24 @@ def test_diagnostics_warn_while_nothing_that_comes_is_of_use(
     new_graph.wait_until(warned, "a warning")
     new_graph.publish(OBJECT_VIEW, make.object_view(float(next(stamps)), "mug"))
     new_graph.wait_until(lambda: new_graph.diagnostics().level == DiagnosticStatus.OK, "its end")
+
+
+def test_who_asks_gets_a_turn_though_views_keep_coming(domain: int) -> None:
+    context = rclpy.Context()
+    context.init(domain_id=domain)
+    node = ScanNode(context=context, enable_rosout=False)
+    try:
+        node._worker = ThreadPoolExecutor(1)
+        node._scanner = Scanner(SimpleNamespace(), ScanSettings())  # type: ignore[arg-type]
+        node._scanner.pending = lambda: True  # type: ignore[method-assign]
+        node._ask_for_estimate()
+        asked = node._submit(lambda: "an answer")
+        assert asked is not None
+        assert asked.result(60) == "an answer"
+    finally:
+        assert node.close(60)
+        node.destroy_node()
+        context.shutdown()
 
 
 def test_what_was_forgotten_meanwhile_is_not_told(monkeypatch: pytest.MonkeyPatch, domain: int) -> None:
