@@ -537,14 +537,11 @@ def _posed_views(path: Path, arguments: argparse.Namespace) -> Iterator[PosedVie
 
 
 def _distinct(found: Sequence[tuple[Path, PosedViews]]) -> list[PosedViews]:
-    """What was found at some places. Where two bear one name, their places stand in it too."""
+    """What was found at some places. Where two bear one name, tables tell their places too."""
     from dataclasses import replace
 
     names = Counter(each.name for _, each in found)
-    return [
-        each if names[each.name] == 1 else replace(each, name=f"{path.parent / path.stem}: {each.name}")
-        for path, each in found
-    ]
+    return [each if names[each.name] == 1 else replace(each, place=str(path)) for path, each in found]
 
 
 def _render(arguments: argparse.Namespace) -> int:

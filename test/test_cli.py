@@ -220,8 +220,13 @@ def test_captures_of_one_name_are_told_apart(tmp_path, posed_capture):
     mugs = [str(tmp_path / day / "mug") for day in ("monday", "tuesday")]
     command = ["evaluate", "--views", "2", "--method", "identity", "--output", str(rows)]
     assert cli.main([*command, *mugs, str(tmp_path / "bowl")]) == 0
-    names = [row["capture"] for row in json.loads(rows.read_text())["rows"]]
-    assert names == [*(f"{mug}: mug" for mug in mugs), "bowl", "mean"]
+    together = {row["capture"]: row for row in json.loads(rows.read_text())["rows"]}
+    assert list(together) == [*(f"{mug}: mug" for mug in mugs), "bowl", "mean"]
+    assert cli.main([*command, mugs[0]]) == 0
+    alone = json.loads(rows.read_text())["rows"][0]
+    for row in (alone, together[f"{mugs[0]}: mug"]):
+        del row["capture"], row["seconds"]
+    assert alone == together[f"{mugs[0]}: mug"]
 
 
 def test_a_capture_named_twice_is_refused(posed_capture, capsys):

@@ -148,11 +148,16 @@ def stands(folder: Path, plan: Plan) -> bool:
     """Whether a shard stands in its place, so that it need not be made again.
 
     Raises:
-        ShardError: It does, and was made by another plan. One without a plan counts as made by this one.
+        ShardError: It does, and was made by another plan, or does not say by which.
     """
+    if not folder.exists():
+        return False
     path = folder / PLAN
-    if path.exists():
-        made, asked = json.loads(path.read_text(encoding="utf-8")), json.loads(json.dumps(plan))
+    if not path.exists():
+        text = f"{folder} does not say how it was made, having no {PLAN}: name another folder, or remove it."
+        raise ShardError(text)
+    made, asked = json.loads(path.read_text(encoding="utf-8")), json.loads(json.dumps(plan))
+    if made != asked:
         for name in {**asked, **made}:
             if made.get(name) != asked.get(name):
                 text = (
@@ -160,7 +165,7 @@ def stands(folder: Path, plan: Plan) -> bool:
                     "name another folder, or remove that one."
                 )
                 raise ShardError(text)
-    return folder.exists()
+    return True
 
 
 @contextmanager

@@ -86,10 +86,18 @@ class PosedViews:
     """The views of one object, read when asked for, and where their cameras truly stood."""
 
     name: str
+    """Draws the orders of the views, together with a seed."""
     camera_from_world: FloatArray
     """(M, 3, 4), any world and unit."""
     view: Callable[[int], View]
     """The k-th view."""
+    place: str = ""
+    """Where it is, told in tables where others bear its name."""
+
+    @property
+    def label(self) -> str:
+        """As it stands in a table."""
+        return f"{self.place}: {self.name}" if self.place else self.name
 
     @classmethod
     def of_views(
@@ -98,7 +106,7 @@ class PosedViews:
         """Views that are held already, as those of a bag are.
 
         Args:
-            name: As it stands in a table.
+            name: Of the object.
             views: The M views.
             camera_from_world: M times (3, 4), any world and unit.
             masked: Whether the views keep their masks.
@@ -190,7 +198,7 @@ def measure(
         seed: Of the orders.
         on_scan: Called after every estimated scan, for a progress bar.
     """
-    return _rows(sequence.name, _scans(sequence, methods, views, orders, seed, on_scan))
+    return _rows(sequence.label, _scans(sequence, methods, views, orders, seed, on_scan))
 
 
 def _scans(
@@ -365,9 +373,9 @@ def evaluate(
         for sequence in sequences:
             # Before the first capture, to know that it can be; then for who interrupts it.
             _write(rows, output)
-            bar.set_postfix_str(sequence.name)
+            bar.set_postfix_str(sequence.label)
             scans = _scans(sequence, chosen, views, orders, seed, bar.update)
-            rows += _rows(sequence.name, scans)
+            rows += _rows(sequence.label, scans)
             for key, group in scans.items():
                 everywhere.setdefault(key, []).extend(group)
     rows += [{**row, **_trust(everywhere[row["method"], row["views"]])} for row in mean_rows(rows)]
@@ -376,7 +384,7 @@ def evaluate(
 
 
 def _require_measurable(sequences: Sequence[PosedViews], least: int) -> None:
-    name, times = Counter(sequence.name for sequence in sequences).most_common(1)[0]
+    name, times = Counter(sequence.label for sequence in sequences).most_common(1)[0]
     if times > 1:
         raise EvaluationError(f"two captures are called {name}; rename one, or name it once.")
     most = max(len(sequence.camera_from_world) for sequence in sequences)
@@ -385,7 +393,7 @@ def _require_measurable(sequences: Sequence[PosedViews], least: int) -> None:
     for each in sequences:
         centres = camera_centre(each.camera_from_world[:, :, :3], each.camera_from_world[:, :, 3])
         if not metrics.scene_scale(centres) > SAME_PLACE * np.abs(centres).max():
-            text = f"{each.name} has all its cameras at one place; distances there mean nothing."
+            text = f"{each.label} has all its cameras at one place; distances there mean nothing."
             raise EvaluationError(text)
 
 

@@ -380,12 +380,16 @@ class ScanNode(LifecycleNode):
 
     def _estimate(self, scanner: Scanner, estimate: Callable[[], list[Result]]) -> list[Result]:
         """One round of estimates, published."""
+        evidence = self._settings.evidence_settings
         if self._estimator is not None:
-            self._estimator.rest_on(self._settings.evidence_settings)
+            self._estimator.rest_on(evidence)
         results = estimate()
+        if self._settings.evidence_settings != evidence:  # set while the estimate was under way
+            scanner.require_estimates()
         with self._telling:
-            self._publish([each for each in results if not each.estimate.cameras or scanner.stands(each)])
-        return results
+            told = [each for each in results if not each.estimate.cameras or scanner.stands(each)]
+            self._publish(told)
+        return told
 
     def _estimate_all(self, scanner: Scanner) -> list[Result]:
         """Each scan anew, published as soon as it is estimated."""
@@ -550,10 +554,12 @@ class ScanNode(LifecycleNode):
 
     def _advice_on_missing_images(self) -> list[str]:
         topics = {kind: self.resolve_topic_name(name) for kind, name, _, _ in INPUTS}
-        images = [topics[each] for each in ("image", "compressed") if topics[each] in self._inputs.publishers]
-        publishers = {topic: self._inputs.publishers[topic] for topic in images}
+        counts = dict(self._inputs.publishers)
+        publishers = {
+            topics[each]: counts[topics[each]] for each in ("image", "compressed") if topics[each] in counts
+        }
         # Views that bring their own camera matrix leave a camera's infos without a use.
-        if not any(publishers.values()) and self._inputs.publishers.get(topics["object_view"]):
+        if not any(publishers.values()) and counts.get(topics["object_view"]):
             return []
         return [missing_images_advice(publishers)]
 
@@ -565,7 +571,7 @@ class ScanNode(LifecycleNode):
             lost=dict(self._inputs.lost),
             longest_callbacks_s=dict(self._longest_callback_s),
             incompatible=self._incompatible.now(),
-            troubles=self._topic_watch.troubles(statistics, self._inputs.lost),
+            troubles=self._topic_watch.troubles(statistics, dict(self._inputs.lost)),
             advice=self._advice,
         )
         status = diagnostic_status(self.get_fully_qualified_name(), health, statistics)

@@ -107,11 +107,11 @@ class IncompatibleQos:
 
     def now(self) -> dict[str, str]:
         """The advice for each topic whose other end is still there."""
-        for topic, (subscribing, _) in list(self._advice.items()):
+        for topic, (subscribing, _) in list(self._advice.items()):  # callbacks of other groups change it
             count = self._node.count_publishers if subscribing else self._node.count_subscribers
             if count(topic) == 0:
-                del self._advice[topic]
-        return {topic: advice for topic, (_, advice) in self._advice.items()}
+                self._advice.pop(topic, None)
+        return {topic: advice for topic, (_, advice) in list(self._advice.items())}
 
     def clear(self) -> None:
         """Forget all."""
@@ -143,6 +143,8 @@ class Inputs:
         self._overrides = overrides
         self._hears = hears
         self._subscriptions: list[Any] = []
+        self._names: dict[str, str] = {}
+        """The node's own name for each topic that is subscribed."""
         self._loss_throttle = Throttle(LOSS_REPEAT_AFTER_S)
 
     @property
@@ -163,15 +165,17 @@ class Inputs:
         """
         for kind, name, message_type, transport in INPUTS:
             if not transport or transport in transports:
-                callback = functools.partial(on_message, kind, self._node.resolve_topic_name(name))
+                topic = self._node.resolve_topic_name(name)
+                callback = functools.partial(on_message, kind, topic)
                 subscription = self._subscribe(message_type, name, callback, INPUT_QOS.reliability)
                 self._subscriptions.append(subscription)
+                self._names[topic] = name
 
     def close(self) -> None:
         """Subscribe to nothing any more, and forget what was counted."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
-        self._subscriptions, self.of_other_types = [], []
+        self._subscriptions, self._names, self.of_other_types = [], {}, []
         self.publishers.clear()
         self.lost.clear()
 
@@ -182,9 +186,9 @@ class Inputs:
             topic, wanted_type = subscription.topic_name, _type_name(subscription.msg_type)
             publishers = self._node.get_publishers_info_by_topic(topic)
             for carried in sorted({each.topic_type for each in publishers} - {wanted_type}):
-                names = {self._node.resolve_topic_name(name): name for _, name, _, _ in INPUTS}
-                instead = next((name for _, name, type_, _ in INPUTS if _type_name(type_) == carried), "")
-                mistyped.append((topic, names[topic], carried, wanted_type, instead))
+                of_that_type = [each for each in self._subscriptions if _type_name(each.msg_type) == carried]
+                instead = self._names[of_that_type[0].topic_name] if of_that_type else ""
+                mistyped.append((topic, self._names[topic], carried, wanted_type, instead))
             if not self._adapts(topic):
                 continue
             offered = {each.qos_profile.reliability for each in publishers}

@@ -23,7 +23,7 @@ class _Entry:
     source: Source
     pose: RobotPose
     claimed: bool = False
-    """Whether a view had its stamp."""
+    """Whether a view had its stamp, held or not."""
 
 
 class RobotPoses:
@@ -32,6 +32,8 @@ class RobotPoses:
     def __init__(self) -> None:
         """Make one without poses."""
         self._entries: OrderedDict[int, _Entry] = OrderedDict()
+        self._passed_over: OrderedDict[int, None] = OrderedDict()
+        """Stamps of views that nobody needs, the latest of them."""
 
     def put(self, source: Source, pose: RobotPose, held: Collection[int]) -> tuple[bool, list[Source]]:
         """Keep a pose, the newer one of a stamp; but none without a covariance instead of one with it.
@@ -47,7 +49,8 @@ class RobotPoses:
         old = self._entries.get(source.stamp_ns)
         if old is not None and (_same(old.pose, pose) or old.pose.stated > pose.stated):
             return False, []
-        self._entries[source.stamp_ns] = _Entry(source, pose, old is not None and old.claimed)
+        claimed = source.stamp_ns in self._passed_over or (old is not None and old.claimed)
+        self._entries[source.stamp_ns] = _Entry(source, pose, claimed)
         if len(self._entries) <= KEPT + len(held):
             return True, []
         oldest = next(stamp_ns for stamp_ns in self._entries if stamp_ns not in held)
@@ -60,6 +63,14 @@ class RobotPoses:
             return None
         entry.claimed = True
         return entry.source
+
+    def pass_over(self, stamp_ns: int) -> None:
+        """Take note of a view that nobody needs: that its pose has no other one is no mistake."""
+        if (entry := self._entries.get(stamp_ns)) is not None:
+            entry.claimed = True
+        self._passed_over[stamp_ns] = None
+        if len(self._passed_over) > KEPT:
+            self._passed_over.popitem(last=False)
 
     def of(self, views: Iterable[View]) -> tuple[RobotPose | None, ...]:
         """The pose of each view, None where there is none; nothing at all where no view has one.

@@ -173,7 +173,7 @@ class Scanner:
         self._taken_back: list[Result] = []
         self._unpaired_since: float | None = None
         self._infos = _InfoRecord()
-        self._failed = 0
+        self._failed = self._turns = 0
         self._last_failure = ""
         self._last_error = ""
 
@@ -216,7 +216,7 @@ class Scanner:
     def estimate_pending(self) -> list[Result]:
         """Estimate a scan that changed since its last estimate and has two views or more.
 
-        Of several the one that was seen least lately. What has to be taken back of others is among the
+        Of several the one whose turn is longest ago. What has to be taken back of others is among the
         results, in the order in which it happened.
 
         All views that came meanwhile are taken together. Call it again while ``pending()``. A result whose
@@ -226,6 +226,7 @@ class Scanner:
         with self._estimating:
             with self._state:
                 changed = [state for state in self._scans.values() if state.buffer.has_work()]
+                changed.sort(key=lambda state: state.turn)
             return self._estimate(changed[:1])
 
     def estimate_now(self, object_id: str | None = None) -> list[Result]:
@@ -249,6 +250,12 @@ class Scanner:
         """The objects of which views are held, the one seen last at the end."""
         with self._state:
             return list(self._scans)
+
+    def require_estimates(self) -> None:
+        """Have every scan estimated, changed or not."""
+        with self._state:
+            for state in self._scans.values():
+                state.buffer.require_work()
 
     def reset(self, reason: str, object_id: str | None = None) -> int:
         """Forget the views of one object, or of all, and what waits for its counterpart.
@@ -376,9 +383,9 @@ class Scanner:
         source = source_of(message, topic)
         pairs = self._pairing.add(kind, Arrival(message, source), camera)
         if kind == "camera_info":
-            self._infos.came(camera, source.stamp_ns, self._clock())
-        if pairs:
-            self._infos.found_image(camera, source.stamp_ns)
+            self._infos.came(camera, source, self._clock())
+        for pair in pairs:
+            self._infos.found_image(camera, pair.info.source)
         receipts = [self._offer_pair(pair) for pair in pairs]
         if not receipts:
             if kind != "camera_info" and self._unpaired_since is None:
@@ -431,6 +438,8 @@ class Scanner:
         text = str(source.rejection(decision.reason))
         if decision.rejected:
             return self._rejected(source.topic, object_id, text)
+        with self._state:
+            self._robot_poses.pass_over(source.stamp_ns)
         return Receipt(False, object_id, text)
 
     def _note_seen(self, object_id: str, decision: Decision) -> None:
@@ -490,6 +499,8 @@ class Scanner:
                 work, arrived = state.buffer.work(), state.arrived
                 if work is None:
                     continue
+                self._turns += 1
+                state.turn = self._turns
                 poses = self._robot_poses.of(work.views)
             scan = Scan(state.buffer.object_id, work.views, poses)
             try:
@@ -505,7 +516,9 @@ class Scanner:
                     if work.without is not None:  # a trial, of a failure that was told
                         continue
                     self._failed += 1
-                    self._last_failure = state.failure = text
+                    self._last_failure = text
+                    if work.epoch == state.buffer.epoch:
+                        state.failure = text
                     # A sentence for the user needs no traceback, a defect does, once.
                     trace = not isinstance(err, RelPoseError) and repr(err) != self._last_error
                     self._last_error = repr(err)
@@ -534,17 +547,19 @@ class _InfoRecord:
 
     def __init__(self) -> None:
         self.alone = 0
-        self._waiting: dict[tuple[str, int], float] = {}
-        self._found: set[tuple[str, int]] = set()
+        self._waiting: dict[tuple[str, int, str], float] = {}
+        """When each came, by its camera, stamp and frame."""
+        self._found: set[tuple[str, int, str]] = set()
         self._latest: deque[bool] = deque(maxlen=10)
 
-    def came(self, camera: str, stamp_ns: int, now: float) -> None:
+    def came(self, camera: str, source: Source, now: float) -> None:
         self.settle(now)
-        self._waiting.setdefault((camera, stamp_ns), now)
+        self._waiting.setdefault((camera, source.stamp_ns, source.frame_id), now)
 
-    def found_image(self, camera: str, stamp_ns: int) -> None:
-        if (camera, stamp_ns) in self._waiting:
-            self._found.add((camera, stamp_ns))
+    def found_image(self, camera: str, source: Source) -> None:
+        key = camera, source.stamp_ns, source.frame_id
+        if key in self._waiting:
+            self._found.add(key)
 
     def settle(self, now: float) -> None:
         """Judge those that came long ago, in their order: how many images get lost is what counts."""
@@ -587,6 +602,8 @@ class _ScanState:
     epoch: int = 0
     """The buffer's, when that estimate was made."""
     failure: str = ""
+    turn: int = 0
+    """Counts the scanner's estimates, when this scan was estimated last."""
 
     def snapshot(self) -> ScanStatistics:
         pairs = () if self.estimate is None else self.estimate.pairs
@@ -599,6 +616,6 @@ class _ScanState:
             status="" if self.estimate is None else self.estimate.status,
             weakest_pair=None if weakest is None else (weakest.i, weakest.j),
             weakest_probability=None if weakest is None else weakest.probability_within_15_deg,
-            failure=self.failure,
+            failure=self.failure if len(self.buffer.views) >= MIN_VIEWS else "",
             declined=self.buffer.declined,
         )

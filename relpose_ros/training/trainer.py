@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from relpose_ros.training.objective import Batch, Targets
 
 _LOG = logging.getLogger(__name__)
+_BY_BUDGET, _BY_SIGNAL = 1, 2
 _BACKBONE = "feature_extractor.feature_extractor."
 """How the names of its weights begin."""
 MEASURED_VIEWS = 4
@@ -180,12 +181,13 @@ class Trainer:
         started = time.monotonic()
         before = self._seconds
         last = (self.images, started)
+        saved = end = 0
         hidden = not progress or self._rank > 0
         with (
             _StopRequest() as stop,
             tqdm(total=self.settings.images, initial=self.images, unit="image", disable=hidden) as bar,
         ):
-            while not self.finished and not self._ends(stop, started, budget_s):
+            while not self.finished and not (end := self._end(stop, started, budget_s)):
                 was = self.images
                 self.train_step()
                 bar.update(self.images - was)
@@ -198,10 +200,12 @@ class Trainer:
                     bar.set_postfix_str(f"rotation {means[1]:.2f}, {speed:.0f} images/s")
                     if check:
                         self.save()  # a measurement that fails must not take the steps with it
+                        saved = self.step
                     self._log(means, speed, self.measure() if check else {})
                     last = (self.images, time.monotonic())
-            self.save()
-        if stop.asked:
+            if not saved or saved < self.step:
+                self.save()
+        if end == _BY_SIGNAL:
             _LOG.info("stopped at step %d; the same command goes on.", self.step)
             raise KeyboardInterrupt
 
@@ -394,7 +398,11 @@ class Trainer:
             steps = Steps(self.settings, self._scans, self._rank)
             plan = StepPlans(self.settings, self.step, self.images, self._processes)
             loader: DataLoader[Any] = DataLoader(
-                steps, batch_size=None, sampler=plan, num_workers=self._workers
+                steps,
+                batch_size=None,
+                sampler=plan,
+                num_workers=self._workers,
+                worker_init_fn=_leave_the_terminal,
             )
             self._batches = iter(loader)
         batch, targets = next(self._batches)
@@ -411,14 +419,16 @@ class Trainer:
             )
         return losses
 
-    def _ends(self, stop: _StopRequest, started: float, budget_s: float | None) -> bool:
-        ends = stop.asked or (budget_s is not None and time.monotonic() - started > budget_s)
+    def _end(self, stop: _StopRequest, started: float, budget_s: float | None) -> int:
+        """Why the run ends before the coming step; 0: it does not."""
+        late = budget_s is not None and time.monotonic() - started > budget_s
+        end = _BY_SIGNAL if stop.asked else _BY_BUDGET if late else 0
         if self._processes > 1:
             # All stop at the same step, or those that go on would wait for ever.
-            flag = torch.tensor(float(ends), device=self._device)
+            flag = torch.tensor(float(end), device=self._device)
             distributed.all_reduce(flag, distributed.ReduceOp.MAX)
-            ends = bool(flag.item())
-        return ends
+            end = int(flag.item())
+        return end
 
     def _log(self, means: Sequence[float], speed: float, accuracy: dict[str, float]) -> None:
         if self._rank > 0:
@@ -467,6 +477,11 @@ class _StopRequest:
         self.asked = True
         if number == signal.SIGINT:
             signal.signal(number, self._before[number])
+
+
+def _leave_the_terminal(_worker: int) -> None:
+    """What ends a command goes to all processes of its group; the step at hand still needs its batch."""
+    os.setsid()
 
 
 def _own_device(device: str) -> torch.device:

@@ -217,8 +217,8 @@ def test_what_was_forgotten_meanwhile_is_not_told(monkeypatch: pytest.MonkeyPatc
             SimpleNamespace(estimate=SimpleNamespace(cameras=n)) for n in ((1, 2), (), (3,))
         )
         scanner: Any = SimpleNamespace(stands=lambda result: result is stands)
-        node._estimate(scanner, lambda: [gone, back, stands])  # type: ignore[list-item]
-        assert told == [back, stands]
+        results = node._estimate(scanner, lambda: [gone, back, stands])  # type: ignore[list-item]
+        assert results == told == [back, stands]
     finally:
         node.destroy_node()
         context.shutdown()

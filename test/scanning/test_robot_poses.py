@@ -43,6 +43,19 @@ def test_a_pose_with_a_covariance_stays_where_one_without_comes() -> None:
         assert poses.of([view(1)]) == (stated,)
 
 
+def test_the_poses_of_views_that_nobody_needs_are_no_strays() -> None:
+    """As of a full scan that keeps its first views, with a pose for each picture, before it or after it."""
+    poses = RobotPoses()
+    for stamp in range(3 * robot_poses.KEPT):
+        if stamp % 2:
+            poses.pass_over(stamp)
+        assert put(poses, stamp) == (True, [])
+        poses.pass_over(stamp)
+    assert len(poses._passed_over) <= robot_poses.KEPT
+    strays = [put(poses, stamp)[1] for stamp in range(10_000, 10_000 + robot_poses.KEPT + 1)]
+    assert strays[-1] == [10_000]
+
+
 def test_no_pose_at_all_is_nothing() -> None:
     poses = RobotPoses()
     put(poses, 1)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 import time
@@ -430,7 +431,32 @@ def test_what_is_taken_back_comes_in_the_order_in_which_it_happened(
     assert told == [("mug", [1, 2], 2), ("mug", [1, 2], 0), ("can", [1, 2], 2), ("mug", [3, 4], 2)]
 
 
-def test_objects_are_estimated_one_by_one_the_least_lately_seen_first(
+@pytest.mark.parametrize("keep", ["latest", "spread", "first"])
+def test_no_object_waits_for_ever_for_another_one_whose_views_keep_coming(
+    bag_messages: Any, circle_estimator: Callable[..., Any], keep: str
+) -> None:
+    """A detector that sends both, mug and can, while an estimate takes longer than a frame."""
+    inner, stamps = circle_estimator(), itertools.count(10)
+    estimated = []
+
+    def estimate(scan: Scan) -> ScanEstimate:
+        estimated.append(scan.object_id)
+        for stamp in itertools.islice(stamps, 3):
+            for object_id in ("mug", "can"):
+                send_views(scanner, bag_messages, stamp, object_id=object_id)
+        return inner.estimate(scan)
+
+    scanner = Scanner(SimpleNamespace(estimate=estimate), ScanSettings(keep=keep, max_views=4))
+    for object_id in ("mug", "can"):
+        send_views(scanner, bag_messages, 1, 2, object_id=object_id)
+    for _ in range(8):
+        scanner.estimate_pending()
+    turns = [estimated.count(object_id) for object_id in ("mug", "can")]
+    assert abs(turns[0] - turns[1]) <= 1
+    assert min(turns) >= 1
+
+
+def test_objects_are_estimated_one_by_one_in_turn(
     bag_messages: Any, circle_estimator: Callable[..., Any]
 ) -> None:
     """So that what is told of one need not wait for all the others."""
@@ -634,6 +660,18 @@ def test_an_estimator_that_fails_does_not_end_the_scan(
     send_views(scanner, bag_messages, 4)
     (result,) = drain(scanner)
     assert stamps_of(result.scan) == [1, 2, 3, 4]
+    assert scanner.statistics().scans["mug"].failure == ""
+
+
+def test_a_scan_that_has_lost_its_views_fails_no_longer(bag_messages: Any) -> None:
+    def estimate(scan: Scan) -> ScanEstimate:
+        raise RelPoseError("no view of it will do")
+
+    scanner = Scanner(SimpleNamespace(estimate=estimate), ScanSettings())
+    send_views(scanner, bag_messages, 1, 2)
+    drain(scanner)
+    assert scanner.statistics().scans["mug"].failure
+    scanner.drop_last_view()
     assert scanner.statistics().scans["mug"].failure == ""
 
 

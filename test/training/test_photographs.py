@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from relpose_ros.captures.folder import Frame, save_capture
-from relpose_ros.captures.shards import Shard, ShardError, new_shard
+from relpose_ros.captures.shards import PLAN, Shard, ShardError, new_shard
 from relpose_ros.geometry import so3
 from relpose_ros.training.batches import FIELDS, Scans, open_scans
 from relpose_ros.training.photographs import (
@@ -71,6 +71,9 @@ def test_shards_of_many_captures_go_on_where_they_were_cut_off(capture, tiny_pre
     for asked, copies, seed in (("copies 2, not 3", 3, 1), ("seed 1, not 2", 2, 2)):
         with pytest.raises(ShardError, match=f"capture was made with {asked}: name another folder"):
             write_capture_shards(folder, [capture], tiny_preset, copies, seed=seed)
+    (folder / "capture" / PLAN).unlink()
+    with pytest.raises(ShardError, match="capture does not say how it was made"):
+        write_capture_shards(folder, [capture], tiny_preset, 2, seed=1)
 
 
 def test_shards_that_cannot_be_made(capture, tiny_preset, tmp_path):

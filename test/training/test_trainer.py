@@ -1,5 +1,6 @@
 """The loop: it learns, resumes to the same weights, stops in time, and its checkpoints survive being cut."""
 
+import contextlib
 import csv
 import os
 import pickle
@@ -48,7 +49,7 @@ def test_a_resumed_run_ends_with_the_same_weights_and_curve(tmp_path, scans):
     whole.run(log_every=2, check_every=12, progress=False)
     assert whole.finished
     first = Trainer(SETTINGS, tmp_path / "halves", scans, scans)
-    first._ends = lambda *_: first.step >= 9
+    first._end = lambda *_: first.step >= 9
     first.run(log_every=2, check_every=12, progress=False)
     first.train_step()  # what comes after the checkpoint is lost
     second = Trainer(SETTINGS, tmp_path / "halves", scans, scans)
@@ -113,6 +114,33 @@ def test_a_signal_ends_a_run_after_its_step_and_saves_it(tmp_path, scans, monkey
     assert Trainer(SETTINGS, tmp_path, scans).step == 3
 
 
+def test_a_signal_to_all_processes_leaves_those_that_prepare_batches_their_work(tmp_path, scans):
+    """As of a terminal or a service; they are ended by the trainer."""
+    (tmp_path / "run.pickle").write_bytes(
+        pickle.dumps((SETTINGS.network, replace(SETTINGS, images=10**7), scans._shards[0]))
+    )
+    script = tmp_path / "script.py"
+    script.write_text(TRAINED_WITH_A_WORKER)
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "a step\n"
+        os.killpg(process.pid, signal.SIGTERM)
+        rest = process.communicate(timeout=120)[0]
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    assert rest.splitlines()[-1] == "saved", rest
+
+
 def test_a_second_signal_ends_a_run_at_once(tmp_path, scans, monkeypatch):
     run = Trainer(SETTINGS, tmp_path, scans)
 
@@ -142,7 +170,7 @@ def test_a_backbone_that_would_climb_is_refused():
 
 def test_a_curve_that_was_emptied_goes_on(tmp_path, scans):
     run = Trainer(SETTINGS, tmp_path, scans)
-    run._ends = lambda *_: run.step >= 2
+    run._end = lambda *_: run.step >= 2
     run.run(log_every=2, progress=False)
     (tmp_path / trainer.CURVE).write_text("", encoding="utf-8")
     Trainer(SETTINGS, tmp_path, scans).run(log_every=4, progress=False)
@@ -210,7 +238,7 @@ def test_the_curve_of_a_run_without_a_checkpoint_begins_anew(tmp_path, scans):
     curve = tmp_path / "run" / trainer.CURVE
     curve.write_text("step,images\n2,16\n", encoding="utf-8")
     run = Trainer(SETTINGS, tmp_path / "run", scans)
-    run._ends = lambda *_: run.step >= 2
+    run._end = lambda *_: run.step >= 2
     run.run(log_every=2, progress=False)
     with curve.open() as stream:
         assert [row["step"] for row in csv.DictReader(stream)] == ["2"]
@@ -348,6 +376,34 @@ def test_under_torchrun_every_process_has_a_gpu_of_its_own(monkeypatch):
     assert trainer._own_device("cuda:1") == torch.device("cuda:1")
     assert trainer._own_device("cpu") == torch.device("cpu")
 
+
+TRAINED_WITH_A_WORKER = """
+import pickle, sys
+from pathlib import Path
+import torch
+from relpose_ros.network.presets import PRESETS
+from relpose_ros.training.batches import Scans
+from relpose_ros.training.trainer import Trainer
+
+torch.set_num_threads(1)
+folder = Path(sys.argv[1])
+PRESETS["tiny"], settings, shard = pickle.loads((folder / "run.pickle").read_bytes())
+run = Trainer(settings, folder / "run", Scans([shard]), workers=1)
+step = run.train_step
+
+def told():
+    losses = step()
+    if run.step == 1:
+        print("a step", flush=True)
+    return losses
+
+run.train_step = told
+try:
+    run.run(progress=False)
+except KeyboardInterrupt:
+    assert Trainer(settings, folder / "run", Scans([shard])).step == run.step >= 1
+    print("saved", flush=True)
+"""
 
 PROCESS = """
 import pickle, sys
