@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from relpose_ros.evaluation.calibration_fit import (
+    _position_sigma,
+    _spread,
     expected_calibration_error,
     fit_calibration,
     measure_calibration,
@@ -77,6 +79,21 @@ def test_well_calibrated_energies_are_left_alone(fisher_scene_type):
     calibration = fit_calibration(observations(fisher_scene_type[0], 80, 1.0, seed=2))
     assert calibration.temperature == pytest.approx(1.0, rel=0.2)
     assert calibration.pair_spread == pytest.approx(1.0, abs=0.3)
+
+
+def test_distances_of_first_cameras_which_are_the_unit_say_nothing_of_the_others(overconfident):
+    _, along = _position_sigma(overconfident[0] + overconfident[1], Calibration())
+    assert along == pytest.approx(SIGMA[2], rel=0.15)
+
+
+def test_as_much_of_a_uniform_distribution_as_asked_for_is_mixed_in(overconfident):
+    assert fit_calibration(overconfident[0], least_flat=0.1).flat >= 0.1
+
+
+def test_a_factor_that_does_not_bring_the_coverages_nearer_is_none():
+    """Nearly right as they are: a factor that mends the one at 90% would spoil it."""
+    assert _spread(np.repeat([2.0, 6.0, 7.0, 20.0], [50, 39, 6, 5])) == 1
+    assert _spread(2 * np.random.default_rng(0).chisquare(3, 10_000)) == pytest.approx(2, rel=0.05)
 
 
 def unit(vector):

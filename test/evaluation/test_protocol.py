@@ -71,6 +71,20 @@ def test_a_perfect_method_is_perfect_at_every_number_of_views():
         assert row["rotation@auc60"] == pytest.approx(1)
 
 
+def test_another_seed_draws_other_scans():
+    sequence = posed(8)
+    first, again, other = (
+        protocol.measure(sequence, [Identity()], [3], orders=2, seed=seed)[0]["rotation@median"]
+        for seed in (0, 0, 4)
+    )
+    assert first == again != other
+
+
+def test_unless_asked_otherwise_scans_have_two_to_eight_views():
+    rows = protocol.evaluate([posed(9)], methods=["identity"], orders=1, progress=False)
+    assert [row["views"] for row in rows if row["capture"] == "thing"] == [2, 3, 4, 5, 6, 7, 8]
+
+
 def test_cameras_without_an_answer_count_as_wrong():
     sequence = posed()
     (row,) = protocol.measure(sequence, [Oracle(sequence, fails_from=3)], [4], orders=2)
@@ -209,6 +223,11 @@ def weights(tmp_path):
         return file
 
     return write
+
+
+def test_each_method_rests_on_its_own_evidence(weights):
+    chosen = protocol._methods([*protocol.EVIDENCE], weights(), 0, None)
+    assert {each.name: each._estimator._evidence for each in chosen} == protocol.EVIDENCE
 
 
 def test_variants_of_the_paper_are_rows_beside_the_methods(weights):

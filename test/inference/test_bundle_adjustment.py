@@ -163,6 +163,25 @@ def test_of_two_groups_that_share_nothing_the_larger_moves(point_scene):
         assert math.degrees(so3.angle_between(found.rotations[camera] @ found.rotations[2].T, truth)) < 0.5
 
 
+def test_of_several_poses_only_those_near_the_cameras_hold_them_together(point_scene):
+    """Matches that are surely right, of one pose or another: three in five say this one."""
+    scene = point_scene.ring(ANGLES)
+    features = scene.features()
+
+    def undecided(other_deg):
+        pairs = {}
+        for pair, each in geometries(scene, features).items():
+            (pose,) = each.poses
+            other = replace(
+                pose, rotation=so3.exp([0, math.radians(other_deg), 0]) @ pose.rotation, weight=0.4
+            )
+            pairs[pair] = replace(each, poses=(replace(pose, weight=0.6), other))
+        return refine(*perturbed(scene), features, pairs).groups
+
+    assert undecided(20) == ((0, 1, 2, 3),)
+    assert undecided(60) == ((0,), (1,), (2,), (3,))
+
+
 def test_too_few_points(point_scene):
     scene = point_scene.ring(ANGLES, points=LEAST_POINTS - 1)
     features = scene.features(noise=0)

@@ -19,7 +19,7 @@ from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.estimator import OWN_THREADS, Estimator, ScanError, _baselines
 from relpose_ros.inference.evidence import EvidenceError, EvidenceSettings
 from relpose_ros.inference.matches import NOTHING, TwoViewGeometry
-from relpose_ros.inference.outlines import find_outline, sighted_translations, sightlines
+from relpose_ros.inference.outlines import UNSIGHTED_SIGMA, find_outline, sighted_translations, sightlines
 from relpose_ros.inference.predictions import about_the_object, predicted_translations, regressed_poses
 from relpose_ros.inference.two_view_poses import RelativePose
 from relpose_ros.network.checkpoint import NetworkFileError, random_network, write_network
@@ -276,6 +276,17 @@ def test_a_calibration_chooses_what_places_the_cameras(by_boxes):
         expected = about_the_object(rotations, predicted, outlines)
     np.testing.assert_allclose(translations, expected, atol=1e-9)
     assert np.linalg.norm(translations[0]) == pytest.approx(1)
+
+
+def test_a_box_tells_where_a_camera_stands_from_the_object(network, ball):
+    """As exactly as the calibration says; of the whole picture nobody says where in it the object is."""
+    calibration = replace(CALIBRATED, position_sigma=(0.01, 0.02))
+    boxed, unboxed = (
+        Estimator(network, calibration, ALONE).estimate(each).cameras[0].covariance[0, 0]
+        for each in (ball, whole(ball))
+    )
+    assert boxed == pytest.approx(0.01**2, rel=0.1)
+    assert unboxed == pytest.approx(UNSIGHTED_SIGMA[0] ** 2, rel=0.1)
 
 
 # A network that regresses poses has no probabilities to tell.

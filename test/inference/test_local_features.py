@@ -292,6 +292,13 @@ def test_where_no_ray_is_known_of_a_pixel_nothing_is_made_of_it(textured):
     assert len(wide.rays) < len(find_features(replace(view, box=BoundingBox(5, 5, 195, 155))).rays)
 
 
+def test_features_of_the_picture_as_it_is_are_counted_without_those_of_unknown_rays(textured, monkeypatch):
+    every = find_features(textured(0))
+    monkeypatch.setattr(local_features, "known_rays", lambda rays: np.arange(len(rays)) >= 10)
+    left = find_features(textured(0))
+    assert (len(left.rays), left.plain) == (len(every.rays) - 10, every.plain - 10)
+
+
 def test_a_mask_alone_keeps_strays_out(textured):
     whole = BoundingBox(0, 0, 200, 160)
     view = replace(textured(0), box=whole)

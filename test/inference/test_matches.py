@@ -16,7 +16,15 @@ from relpose_ros.geometry.cameras import homogeneous
 from relpose_ros.inference import matches, two_view_poses
 from relpose_ros.inference.calibration import Calibration
 from relpose_ros.inference.local_features import DescriptorMap, LocalFeatures, find_features
-from relpose_ros.inference.matches import NOTHING, Matcher, TwoViewGeometry, peaks, relate, trust
+from relpose_ros.inference.matches import (
+    MATCHING_FLOOR,
+    NOTHING,
+    Matcher,
+    TwoViewGeometry,
+    peaks,
+    relate,
+    trust,
+)
 from relpose_ros.inference.outlines import Outline
 from relpose_ros.inference.two_view_poses import LEAST_MATCHES, RelativePose, Support, explain
 from relpose_ros.network.checkpoint import read_metadata
@@ -89,6 +97,14 @@ def test_same_bits_twice(point_scene):
     for a, b in zip(first.poses, second.poses, strict=True):
         for name in ("rotation", "direction", "covariance", "direction_covariance"):
             assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
+
+
+def test_features_of_one_place_are_told_as_the_first_there(point_scene):
+    first, second = point_scene.ring([0, 25]).features()
+    twice = replace(first, places=first.places // 2 * 2)
+    found = relate(twice, second)
+    assert len(found.inliers) > 50
+    assert (found.inliers[:, 0] % 2 == 0).all()
 
 
 def test_more_points_say_it_more_exactly(point_scene):
@@ -397,6 +413,19 @@ def test_peaks_share_the_probability_of_the_poses():
     deviations = [math.degrees(math.sqrt(np.linalg.eigvalsh(peak.covariance).max())) for peak in found]
     assert min(deviations) > 0.3
     assert sorted(deviations)[-1] > 5
+
+
+def test_no_peak_is_sharper_than_the_intrinsics_allow():
+    found = peaks(TwoViewGeometry((pose(np.eye(3), 1.0, sigma=1e-6),), np.zeros((9, 2), np.int64), 0.9))
+    assert len(found) == 2
+    for peak in found:
+        assert np.linalg.eigvalsh(peak.covariance).min() >= MATCHING_FLOOR**2
+
+
+def test_matches_that_are_more_likely_wrong_than_right_put_no_peak():
+    one = (pose(np.eye(3), 1.0),)
+    told = [bool(peaks(TwoViewGeometry(one, np.zeros((9, 2), np.int64), chance))) for chance in (0.49, 0.51)]
+    assert told == [False, True]
 
 
 @pytest.mark.parametrize(("weights", "told"), [((0.3, 0.25), True), ((0.2, 0.15, 0.1), False)])

@@ -118,6 +118,32 @@ def test_only_what_the_network_says_alone_is_widened_by_its_factor(fisher_scene,
         np.testing.assert_allclose(after.modes[0].covariance, factor * before.modes[0].covariance)
 
 
+def test_the_cameras_rotations_are_widened_by_their_factor(fisher_scene, cameras_around):
+    scene = fisher_scene(cameras_around(3, 2), concentration=50.0)
+    plain, widened = (told(scene, Calibration(rotation_spread=factor))[1] for factor in (1.0, 4.0))
+    np.testing.assert_allclose(widened[1:, 3:, 3:], 4 * plain[1:, 3:, 3:], rtol=0.01, atol=1e-5)
+
+
+def test_only_where_matches_are_sure_is_a_gross_error_no_part_of_the_covariance(fisher_scene, cameras_around):
+    """A sharp peak, and otherwise any rotation: of three in five the rest counts, of 97 in a hundred not."""
+    scene = fisher_scene(cameras_around(2, 4), concentration=0.0)
+    deviations = []
+    for chance in (0.6, 0.97):
+        evidence = RotationEvidence([[Peak(scene.relative(0, 1), 1e-4 * np.eye(3), chance)]])
+        energies = PairEnergies.of(scene, scene, 2, evidence=evidence)
+        covariances = camera_covariances(
+            search(energies, GridEmbeddings(scene)),
+            energies,
+            torch.from_numpy(scene.cameras),
+            np.tile([0.0, 0.0, 1.0], (2, 1)),
+            UNCALIBRATED,
+            np.full((2, 2), 0.1),
+        )
+        deviations.append(math.degrees(math.sqrt(np.trace(covariances[1, 3:, 3:]) / 3)))
+    assert deviations[0] > 30
+    assert deviations[1] < 3
+
+
 def test_the_first_cameras_distance_is_the_unit(fisher_scene, cameras_around):
     calibration = Calibration(position_sigma=(0.02, 0.05))
     _, covariances, _ = told(fisher_scene(cameras_around(3, 5)), calibration)
