@@ -152,20 +152,27 @@ def stands(folder: Path, plan: Plan) -> bool:
     """
     if not folder.exists():
         return False
-    path = folder / PLAN
-    if not path.exists():
+    made, asked = read_plan(folder), json.loads(json.dumps(plan))
+    if made is None:
         text = f"{folder} does not say how it was made, having no {PLAN}: name another folder, or remove it."
         raise ShardError(text)
-    made, asked = json.loads(path.read_text(encoding="utf-8")), json.loads(json.dumps(plan))
-    if made != asked:
-        for name in {**asked, **made}:
-            if made.get(name) != asked.get(name):
-                text = (
-                    f"{folder} was made with {name} {made.get(name)!r}, not {asked.get(name)!r}: "
-                    "name another folder, or remove that one."
-                )
-                raise ShardError(text)
+    for name in {**asked, **made}:
+        if made.get(name) != asked.get(name):
+            text = (
+                f"{folder} was made with {name} {made.get(name)!r}, not {asked.get(name)!r}: "
+                "name another folder, or remove that one."
+            )
+            raise ShardError(text)
     return True
+
+
+def read_plan(folder: Path) -> dict[str, Any] | None:
+    """How a shard was made; None where it does not say."""
+    path = folder / PLAN
+    if not path.exists():
+        return None
+    plan: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return plan
 
 
 @contextmanager

@@ -564,14 +564,15 @@ class ScanNode(LifecycleNode):
         return [missing_images_advice(publishers)]
 
     def _publish_diagnostics(self, statistics: Statistics | None) -> None:
+        lost = dict(self._inputs.lost)
         health = NodeHealth(
             state=self._state_machine.current_state[1],
             failure=self._failure,
             publishers=dict(self._inputs.publishers),
-            lost=dict(self._inputs.lost),
+            lost=lost,
             longest_callbacks_s=dict(self._longest_callback_s),
             incompatible=self._incompatible.now(),
-            troubles=self._topic_watch.troubles(statistics, dict(self._inputs.lost)),
+            troubles=self._topic_watch.troubles(statistics, lost),
             advice=self._advice,
         )
         status = diagnostic_status(self.get_fully_qualified_name(), health, statistics)

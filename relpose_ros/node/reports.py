@@ -32,11 +32,12 @@ class LogForwarder(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log one record. A line of its own for each severity: rclpy refuses a call site that changes it."""
-        text: str | None = self.format(record)
+        text = self.format(record)
         if record.levelno >= logging.WARNING:
-            text = self._throttle.pass_on(record.levelname, text or "")
-        if text is None:
-            return
+            line = self._throttle.pass_on(record.levelname, text)
+            if line is None:
+                return
+            text = line
         if record.levelno >= logging.ERROR:
             self._ros.error(text)
         elif record.levelno >= logging.WARNING:

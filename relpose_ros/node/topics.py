@@ -21,7 +21,7 @@ from relpose_ros.msg import ObjectView, ScanEstimate
 from relpose_ros.node.reports import Throttle, loss_advice, qos_advice
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable, Collection, Iterator
 
     from rclpy.node import Node
 
@@ -81,14 +81,21 @@ def require_topics_of_their_own(node: Node, transports: Collection[str]) -> None
     Raises:
         TopicError: Two are.
     """
-    names = [name for _, name, _, transport in INPUTS if not transport or transport in transports]
+    names = [*(name for _, name, _ in _asked_for(transports)), *(name for name, _ in OUTPUTS)]
     by_topic: dict[str, str] = {}
-    for name in (*names, *(name for name, _ in OUTPUTS)):
+    for name in names:
         topic = node.resolve_topic_name(name)
         if topic in by_topic:
             text = f"{by_topic[topic]} and {name} are both remapped to {topic}, where one type alone can be: "
             raise TopicError(f"{text}give each a topic of its own.")
         by_topic[topic] = name
+
+
+def _asked_for(transports: Collection[str]) -> Iterator[tuple[Kind, str, Any]]:
+    """Kind, name and type of each input that these image transports ask for."""
+    for kind, name, message_type, transport in INPUTS:
+        if not transport or transport in transports:
+            yield kind, name, message_type
 
 
 class IncompatibleQos:
@@ -163,13 +170,12 @@ class Inputs:
             RuntimeError: The quality of service that was given is refused.
             ParameterException: Likewise.
         """
-        for kind, name, message_type, transport in INPUTS:
-            if not transport or transport in transports:
-                topic = self._node.resolve_topic_name(name)
-                callback = functools.partial(on_message, kind, topic)
-                subscription = self._subscribe(message_type, name, callback, INPUT_QOS.reliability)
-                self._subscriptions.append(subscription)
-                self._names[topic] = name
+        for kind, name, message_type in _asked_for(transports):
+            topic = self._node.resolve_topic_name(name)
+            callback = functools.partial(on_message, kind, topic)
+            subscription = self._subscribe(message_type, name, callback, INPUT_QOS.reliability)
+            self._subscriptions.append(subscription)
+            self._names[topic] = name
 
     def close(self) -> None:
         """Subscribe to nothing any more, and forget what was counted."""

@@ -147,9 +147,10 @@ class ScanBuffer:
         if declined is not None:
             return declined
         if self._order.confirms_jump(view.stamp_ns, view.frame_id, topic):
-            suspects = self._order.suspects(topic)
-            self._follow_jump(suspects[0][0])
-            for each, origin in suspects:
+            first = self._order.suspected(topic)
+            together = self._order.suspects_at(first.stamp_ns)
+            self._follow_jump(first)
+            for each, origin in together:
                 if not self._order.was_seen(each.stamp_ns, each.frame_id):
                     self._take(each, origin)
         elif self._order.jumps_back(view.stamp_ns, view.frame_id, topic):

@@ -106,16 +106,18 @@ class StampOrder:
         is_new = topic in self._newest_on and (topic, frame_id) not in self._newest_of
         return not is_new or stamp_ns >= first.stamp_ns + self.backward_jump_ns
 
-    def suspects(self, topic: str) -> list[tuple[View, str]]:
-        """The views, with their topics, that were suspected first after the jump; the topic's own first."""
-        first = self._suspects[topic][0]
-        together = [
+    def suspected(self, topic: str) -> View:
+        """The topic's first view after a jump that is confirmed."""
+        return self._suspects[topic][0]
+
+    def suspects_at(self, stamp_ns: int) -> list[tuple[View, str]]:
+        """The suspected views of a stamp, with their topics."""
+        return [
             (each, origin)
             for origin, views in self._suspects.items()
             for each in views
-            if each.stamp_ns == first.stamp_ns
+            if each.stamp_ns == stamp_ns
         ]
-        return sorted(together, key=lambda each: each[0] is not first)
 
     def restart(self, *, seen_too: bool) -> None:
         """Begin anew with what comes next.

@@ -6,7 +6,6 @@ place of the images: see `relpose_ros.training.batches.MAP`. About 45 kB an imag
 
 from __future__ import annotations
 
-import json
 import zlib
 from collections import Counter
 from dataclasses import asdict
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from relpose_ros.captures.shards import PLAN, Shard, ShardError, new_shard, stands
+from relpose_ros.captures.shards import Shard, ShardError, new_shard, read_plan, stands
 from relpose_ros.training.batches import FIELDS, MAP, augmented, normalised, shards_in
 
 if TYPE_CHECKING:
@@ -70,8 +69,8 @@ def write_feature_shards(
         "seed": seed,
     }
     for name, path in tqdm(wanted, unit="shard"):
-        source_plan = json.loads((path / PLAN).read_text(encoding="utf-8")) if (path / PLAN).exists() else {}
-        plan = {**made, **{f"source's {name}": value for name, value in source_plan.items()}}
+        of_source = {f"source's {name}": value for name, value in (read_plan(path) or {}).items()}
+        plan = {**made, **of_source}
         if stands(folder / name, plan):
             continue
         source = _images_for(network, path)

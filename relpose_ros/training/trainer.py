@@ -181,7 +181,7 @@ class Trainer:
         started = time.monotonic()
         before = self._seconds
         last = (self.images, started)
-        saved = end = 0
+        saved, end = -1, 0
         hidden = not progress or self._rank > 0
         with (
             _StopRequest() as stop,
@@ -203,7 +203,7 @@ class Trainer:
                         saved = self.step
                     self._log(means, speed, self.measure() if check else {})
                     last = (self.images, time.monotonic())
-            if not saved or saved < self.step:
+            if saved != self.step:
                 self.save()
         if end == _BY_SIGNAL:
             _LOG.info("stopped at step %d; the same command goes on.", self.step)

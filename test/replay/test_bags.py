@@ -233,16 +233,21 @@ def test_what_is_no_bag_is_told_in_a_sentence(tmp_path: Path, kind: str, sentenc
     assert str(path) in str(refusal.value)
 
 
-def test_the_bags_own_definition_of_a_type_is_believed(tmp_path: Path) -> None:
-    """An older ObjectView with other fields is read by its own definition, not by today's."""
+def write_older_object_view(path: Path) -> None:
+    """A bag with an ObjectView of other fields than today's."""
     from rosbags.typesys import get_types_from_msg
 
     old = get_typestore(Stores.ROS2_JAZZY)
     old.register(get_types_from_msg("string object_id\nuint8 sharpness", OBJECT_VIEW))
-    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/object_view", OBJECT_VIEW, typestore=old)
         message = old.types[OBJECT_VIEW](object_id="mug", sharpness=7)
         writer.write(connection, 1, old.serialize_cdr(message, OBJECT_VIEW))
+
+
+def test_the_bags_own_definition_of_a_type_is_believed(tmp_path: Path) -> None:
+    """An older ObjectView with other fields is read by its own definition, not by today's."""
+    write_older_object_view(tmp_path / "bag")
     with BagReader(tmp_path / "bag") as bag:
         (record,) = bag.records(["/object_view"])
     assert (record.message.object_id, record.message.sharpness) == ("mug", 7)
@@ -250,14 +255,7 @@ def test_the_bags_own_definition_of_a_type_is_believed(tmp_path: Path) -> None:
 
 def test_the_bags_own_definition_goes_before_that_of_this_package(tmp_path: Path) -> None:
     """Also where the bag has none of another type."""
-    from rosbags.typesys import get_types_from_msg
-
-    old = get_typestore(Stores.ROS2_JAZZY)
-    old.register(get_types_from_msg("string object_id\nuint8 sharpness", OBJECT_VIEW))
-    with Writer(tmp_path / "one", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection("/object_view", OBJECT_VIEW, typestore=old)
-        message = old.types[OBJECT_VIEW](object_id="mug", sharpness=7)
-        writer.write(connection, 1, old.serialize_cdr(message, OBJECT_VIEW))
+    write_older_object_view(tmp_path / "one")
     write_strings(tmp_path / "two", {"/a": [2]}, StoragePlugin.SQLITE3)
     drop_definitions(only_file(tmp_path / "two", ".db3"))
     (tmp_path / "bag").mkdir()
